@@ -29,14 +29,14 @@ WARM_UP = 4
 def fluxvla(root: Path, kind: str, workers: int) -> Iterable[Any]:
     from fluxvla_core.data.dataset import ParquetDataset
     from fluxvla_core.data.loader import DictCollator, make_loader
-    from fluxvla_core.data.sampler import EpochSampler
+    from fluxvla_core.data.sampler import StepPlan, StepSampler
 
     cameras = CAMERAS if kind == "mp4" else ()
     dataset = ParquetDataset(str(root), [], cameras, action_window_size=CHUNK)
     images = ("images", "img_masks") if cameras else ()
     keys = [*images, "states", "actions", "action_masks", "timestamp", "sample_ids"]
     collate = DictCollator(keys, ["task_description", "info"])
-    return make_loader(dataset, collate, EpochSampler(len(dataset), BATCH), workers)
+    return make_loader(dataset, collate, StepSampler(StepPlan(len(dataset), BATCH)), workers)
 
 
 def lerobot(root: Path, kind: str, workers: int) -> Iterable[Any]:

@@ -22,9 +22,8 @@ from benchmarks._pi05_model import SIZES, BenchPi05
 from fluxvla_core import RunContext, build_runner_from_cfg
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.data.loader import DictCollator
-from fluxvla_core.data.sampler import SampleKey
-from fluxvla_core.training import memory
-from fluxvla_core.training.batches import StepPlan, StepSampler
+from fluxvla_core.data.sampler import SampleKey, StepPlan, StepSampler
+from fluxvla_core.training import cost
 from fluxvla_core.training.model import checkpoint_activations, compile_units, units_of
 
 BENCH = "bench"
@@ -158,7 +157,7 @@ def our_config(setup: Setup) -> dict[str, Any]:
 
 def by_runner(setup: Setup, work_dir: Path) -> tuple[Callable[[int], float], Any]:
     """What does so many steps and gives the last loss, and the runner; nothing is saved."""
-    from fluxvla_core.training.progress import Progress
+    from fluxvla_core.training.state import Progress
     from fluxvla_core.training.stop import StopRequest
     from fluxvla_core.training.trainer import Trainer
 
@@ -253,7 +252,7 @@ def measure(side: str, setup: Setup, profile: bool, out: Path) -> None:
         if cuda:
             torch.cuda.synchronize()
         taken.append((time.perf_counter() - began) / setup.steps)
-    found |= {"step_s": taken, "peak_bytes": memory.peak_bytes(cuda)}
+    found |= {"step_s": taken, "peak_bytes": cost.peak_bytes(cuda)}
     found["device"] = torch.cuda.get_device_name() if cuda else "cpu"
     if runner is not None and runner.flops is not None:
         found |= {"flops": runner.flops.per_batch, "peak_flops": runner.flops.peak}

@@ -44,7 +44,7 @@ from fluxvla_core.policies.execution import (
 from fluxvla_core.policies.inference_weights import QUANTIZATIONS, check_quantization, ready
 from fluxvla_core.policies.local import PRECISIONS
 from fluxvla_core.policies.roofline import BANDWIDTHS_GB_S, Work, work_of
-from fluxvla_core.training.flops import PEAK_TFLOPS
+from fluxvla_core.training.cost import PEAK_TFLOPS
 
 PUBLISHED = (
     {"who": "FlashRT", "what": "pi0.5, 2 views, FP8, RTX 5090", "ms": 17.58},

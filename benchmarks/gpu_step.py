@@ -38,7 +38,7 @@ from benchmarks import _results
 from benchmarks._gpu_step_sides import BENCH, FAMILIES, HAND, OURS, Setup, measure
 from benchmarks._pi05_model import ATTENTION, SIZES
 from fluxvla_core.testing.training import run_ranks
-from fluxvla_core.training import memory
+from fluxvla_core.training import cost
 
 RATE_GOAL, MFU_GOAL = 25.0, 0.35
 LONGEST_S = 3600.0
@@ -65,7 +65,7 @@ def summarise(runs: Mapping[str, Sequence[Found]], setup: Setup) -> dict[str, An
             "step_s": seconds,
             "steps_s": [found["step_s"] for found in rounds],
             "mfu": statistics.median(told) if told else None,
-            "peak_memory_gb": max(found["peak_bytes"] for found in rounds) / memory.GB,
+            "peak_memory_gb": max(found["peak_bytes"] for found in rounds) / cost.GB,
             "last_loss": rounds[-1]["last_loss"],
         }
     pairs = zip(runs[HAND], runs[OURS], strict=True)

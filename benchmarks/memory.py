@@ -21,7 +21,7 @@ from torch import nn
 from benchmarks import _results
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.config.load import load_config
-from fluxvla_core.training.footprint import NOTHING, Kept, footprint, optimizer_bytes
+from fluxvla_core.training.cost import NOTHING, Kept, footprint, optimizer_bytes
 from fluxvla_core.training.rehearsal import kept_of, rehearse
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -164,7 +164,7 @@ def by_hand(kind: str, name: str) -> Callable[[int], None]:
 
 def by_runner(kind: str, name: str, work_dir: Path) -> Callable[[int], None]:
     """A function that lets the runner's loop do so many steps; checkpoints are not written."""
-    from fluxvla_core.training.progress import Progress
+    from fluxvla_core.training.state import Progress
     from fluxvla_core.training.stop import StopRequest
     from fluxvla_core.training.trainer import Trainer
 

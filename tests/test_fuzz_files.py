@@ -39,8 +39,7 @@ from fluxvla_core.evaluation.compare import read as read_evaluated
 from fluxvla_core.evaluation.eval_log import EvalLog
 from fluxvla_core.results import open_recording
 from fluxvla_core.training.lora import LoraOptions
-from fluxvla_core.training.optimizer_state import SavedOptimizer
-from fluxvla_core.training.progress import Progress, SavedTrainer
+from fluxvla_core.training.state import Progress, SavedOptimizer, SavedTrainer
 from fluxvla_core.training.weights import SavedWeights
 
 CASES = 60

@@ -164,8 +164,8 @@ def test_only_public_names_are_imported(path):
 
 
 def test_a_private_import_is_found():
-    planted = "def f():\n    from fluxvla_core.training.parameters import trainable\n"
-    assert private(planted) == ["fluxvla_core.training.parameters: trainable"]
+    planted = "def f():\n    from fluxvla_core.training.model import trainable\n"
+    assert private(planted) == ["fluxvla_core.training.model: trainable"]
     assert private("from fluxvla_core.training import _NEED") == ["fluxvla_core.training: _NEED"]
 
 

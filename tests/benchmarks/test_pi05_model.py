@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from benchmarks import _pi05_attention
 from benchmarks._pi05_attention import Places, attend, first, first_packed
 from benchmarks._pi05_model import SIZES, BenchPi05, ExpertLayer, LanguageLayer, Size
-from fluxvla_core.training.flops import on_meta, training_flops
+from fluxvla_core.training.cost import on_meta, training_flops
 from fluxvla_core.training.model import units_of
 
 S = SIZES["tiny"]

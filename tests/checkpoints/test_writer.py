@@ -12,9 +12,11 @@ import sys
 import pytest
 
 from fluxvla_core.atomic import prepare_folder
-from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
-from fluxvla_core.checkpoints.retention import (
+from fluxvla_core.checkpoints.checkpoint import (
+    Checkpoint,
     clear_leftovers,
+    folders,
+    latest,
     name_best,
     rotate,
     set_aside_later,

@@ -12,7 +12,7 @@ from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.data import frames
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import DictCollator, make_loader
-from fluxvla_core.data.sampler import EpochSampler, SampleKey
+from fluxvla_core.data.sampler import SampleKey, StepPlan, StepSampler
 from fluxvla_core.data.video_decode import VideoFile
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch
 
@@ -343,7 +343,7 @@ def test_batches_do_not_depend_on_workers(shared, cache):
 
     def batches(workers):
         dataset = load(shared, TRANSFORMS, cache_frames=cache)
-        loader = make_loader(dataset, collate, EpochSampler(len(dataset), 4), workers)
+        loader = make_loader(dataset, collate, StepSampler(StepPlan(len(dataset), 4)), workers)
         return list(islice(loader, 9))
 
     for one, two in zip(batches(0), batches(2), strict=True):

@@ -12,7 +12,7 @@ import pytest
 
 from fluxvla_core.build import build_dataset_from_cfg
 from fluxvla_core.cli.main import main
-from fluxvla_core.data.sampler import EpochSampler, sample_rng
+from fluxvla_core.data.sampler import StepPlan, sample_rng
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
@@ -73,8 +73,8 @@ def test_statistics_are_the_same(dataset: Any) -> None:
 
 
 def test_order_and_noise_are_the_same() -> None:
-    sampler = EpochSampler(EXPECTED["samples"], 5, seed=7)
-    assert [sampler.order(epoch).tolist() for epoch in range(2)] == EXPECTED["order"]
+    plan = StepPlan(EXPECTED["samples"], 5, seed=7)
+    assert [plan.order(epoch).tolist() for epoch in range(2)] == EXPECTED["order"]
     assert sample_rng(7, 1, 2).standard_normal(3).tolist() == EXPECTED["noise"]
 
 

@@ -12,7 +12,7 @@ from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
-from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.sampler import StepPlan, StepSampler
 from fluxvla_core.data.transforms.images import normalized
 from fluxvla_core.errors import ConfigError, DataError
 from fluxvla_core.training.model import check_observations
@@ -90,8 +90,8 @@ def test_batches_do_not_depend_on_workers_or_on_where_images_are_normalised(shar
     dataset = load(shared, TRANSFORMS)
     batches = []
     for source, workers in ((dataset, 0), (dataset, 2), (dataset.deferring(), 0)):
-        sampler = EpochSampler(len(dataset), 4, seed=3)
-        loader = make_loader(source, DictCollator(KEYS, META), list(sampler.batches(0)), workers)
+        sampler = StepSampler(StepPlan(len(dataset), 4, seed=3))
+        loader = make_loader(source, DictCollator(KEYS, META), list(sampler.epoch(0)), workers)
         batches.append([normalized(batch) for batch in loader])
     first = batches[0]
     assert first[0]["images"].shape == (4, 3, 6, 16, 24)

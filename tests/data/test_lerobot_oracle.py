@@ -24,7 +24,7 @@ from fluxvla_core.data.convert import convert
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.inspection import validate
 from fluxvla_core.data.loader import DictCollator, make_loader
-from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.sampler import StepPlan, StepSampler
 from fluxvla_core.policies.loading import load_policy
 from tools import lerobot_env, shell
 
@@ -195,7 +195,7 @@ def test_batches_of_a_dataset_that_lerobot_recorded(seen):
     dataset = ParquetDataset(str(seen["theirs"].root), transforms, CAMERAS, cache_frames=True)
     keys = ["images", "states", "actions", "action_masks", "noise", "time"]
     rest = ["img_masks", "sample_ids", "timestamp", "task_description", "stats", "info"]
-    loader = make_loader(dataset, DictCollator(keys, rest), EpochSampler(len(dataset), 8))
+    loader = make_loader(dataset, DictCollator(keys, rest), StepSampler(StepPlan(len(dataset), 8)))
     for batch in islice(loader, 4):
         assert batch["images"].shape == (8, 6, 16, 24)
         assert all(torch.isfinite(batch[key]).all() for key in keys)

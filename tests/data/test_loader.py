@@ -21,7 +21,7 @@ import torch
 
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.data.loader import DictCollator, make_loader
-from fluxvla_core.data.sampler import EpochSampler, Position, sample_rng
+from fluxvla_core.data.sampler import Cursor, StepPlan, StepSampler, sample_rng
 from fluxvla_core.errors import ConfigError, DataError
 
 collate = DictCollator(["x", "noise"])
@@ -62,7 +62,7 @@ class Careless(Noisy):
 
 
 def batches(count, workers=0, dataset=None, start=None, rank=0, world=1, seed=42, collate=collate):
-    sampler = EpochSampler(10, 2, rank=rank, world=world, start=start)
+    sampler = StepSampler(StepPlan(10, 2, world=world), rank, start)
     loader = make_loader(dataset or Noisy(), collate, sampler, workers, seed=seed)
     return list(islice(loader, count))
 
@@ -77,8 +77,8 @@ def test_workers_change_nothing():
 
 def test_a_position_resumes_with_equal_batches():
     whole = batches(9)
-    assert equal(whole[6:], batches(3, start=Position(1, 1)))
-    assert equal(whole[6:], batches(3, workers=1, start=Position(1, 1)))
+    assert equal(whole[6:], batches(3, start=Cursor(1, 2)))
+    assert equal(whole[6:], batches(3, workers=1, start=Cursor(1, 2)))
 
 
 def test_world_size_changes_who_loads_but_not_what():
@@ -95,7 +95,7 @@ def test_global_generators_draw_by_the_batch_and_not_by_who_makes_it():
     """D3 of the field notes, for workers: theirs began alike on every rank and after a restart."""
     whole = batches(9, dataset=Careless())
     assert equal(whole, batches(9, workers=2, dataset=Careless()))
-    assert equal(whole[6:], batches(3, start=Position(1, 1), workers=2, dataset=Careless()))
+    assert equal(whole[6:], batches(3, start=Cursor(1, 2), workers=2, dataset=Careless()))
     assert len(np.unique(noise(whole))) == 9 * 2 * 4
 
 
@@ -131,7 +131,7 @@ def test_what_numpy_draws_beside_a_loader_does_not_depend_on_its_workers():
 
     def beside(workers):
         np.random.seed(1)
-        loader = make_loader(Careless(), collate, EpochSampler(10, 2), workers)
+        loader = make_loader(Careless(), collate, StepSampler(StepPlan(10, 2)), workers)
         return [np.random.standard_normal() for _ in islice(loader, 3)]
 
     assert beside(0) == beside(2)
@@ -150,7 +150,7 @@ def test_preparing_is_reported():
         def progress(self, name, done, total, **fields):
             reported.append((name, done, total))
 
-    make_loader(Grouped(), collate, EpochSampler(10, 2), reporter=Reports())
+    make_loader(Grouped(), collate, StepSampler(StepPlan(10, 2)), reporter=Reports())
     assert reported == [("decode frames", 3, 3)]
 
 
@@ -165,7 +165,7 @@ def test_an_error_arrives_as_it_was_raised(workers):
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_an_error_of_the_collator_arrives_too(workers):
-    loader = make_loader(Noisy(), DictCollator(["x"]), EpochSampler(4, 2), workers)
+    loader = make_loader(Noisy(), DictCollator(["x"]), StepSampler(StepPlan(4, 2)), workers)
     with pytest.raises(DataError, match="'noise' is in neither keys nor meta_keys"):
         next(iter(loader))
 
@@ -199,7 +199,11 @@ class Handed:
 
 def test_a_trainer_that_is_gone_while_it_takes_a_batch_is_no_error_of_the_worker(capfd):
     loader = make_loader(
-        Handed(), DictCollator(["x"], ["address"]), EpochSampler(10, 2), 1, prefetch_factor=1
+        Handed(),
+        DictCollator(["x"], ["address"]),
+        StepSampler(StepPlan(10, 2)),
+        1,
+        prefetch_factor=1,
     )
     taken = iter(loader)
     address = next(taken)["address"][0]
@@ -212,7 +216,7 @@ def test_a_trainer_that_is_gone_while_it_takes_a_batch_is_no_error_of_the_worker
 
 def test_negative_workers_are_refused():
     with pytest.raises(ConfigError, match="per_device_num_workers must be at least 0, got -1"):
-        make_loader(Noisy(), collate, EpochSampler(4, 2), -1)
+        make_loader(Noisy(), collate, StepSampler(StepPlan(4, 2)), -1)
 
 
 TRAINER = """
@@ -220,7 +224,7 @@ import multiprocessing, signal, sys, time
 import numpy as np
 from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.loader import make_loader
-from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.sampler import StepPlan, StepSampler
 
 class Numbers:
     def get_sample(self, index, epoch):
@@ -228,7 +232,7 @@ class Numbers:
 
 if __name__ == "__main__":
     loader = make_loader(
-        Numbers(), DictCollator(["x"]), EpochSampler(10, 2), 2, multiprocessing_context=sys.argv[1]
+        Numbers(), DictCollator(["x"]), StepSampler(StepPlan(10, 2)), 2, multiprocessing_context=sys.argv[1]
     )
     batches = iter(loader)
     next(batches)

@@ -15,9 +15,9 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset, first_dataset, shares
-from fluxvla_core.data.sampler import EpochSampler, SampleKey
+from fluxvla_core.data.sampler import SampleKey, StepPlan, StepSampler
 from fluxvla_core.errors import ConfigError, DataError, SpecMismatch
-from fluxvla_core.training.rng import seeds_of
+from fluxvla_core.training.state import seeds_of
 
 NOISE = {"type": "SampleFlowNoise"}
 NORMALISE = {"type": "NormalizeStatesAndActions"}
@@ -303,7 +303,7 @@ def test_shares_are_exact_in_sum_and_near_in_each(total):
 def batches(shared, others, count, workers=0, rank=0, world=1):
     tables = [table(root, transforms=[NORMALISE, NOISE]) for root in (shared, others[0])]
     dataset = mixture(*tables, weights=[1, 1], samples_per_epoch=20)
-    sampler = EpochSampler(len(dataset), 4, rank=rank, world=world)
+    sampler = StepSampler(StepPlan(len(dataset), 4, world=world), rank)
     return list(islice(make_loader(dataset, DictCollator(KEYS, META), sampler, workers), count))
 
 

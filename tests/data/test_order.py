@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fluxvla_core.data.dataset import ParquetDataset
-from fluxvla_core.data.sampler import EpisodeShards, EpochSampler, epoch_order
+from fluxvla_core.data.sampler import EpisodeShards, StepPlan, StepSampler, epoch_order
 from fluxvla_core.errors import ConfigError
 
 lengths = st.lists(st.integers(1, 9), min_size=1, max_size=12)
@@ -48,8 +48,9 @@ def test_all_episodes_together_mix_everything():
 
 def test_ranks_share_the_order_out():
     shards = EpisodeShards(np.array([5, 11, 16, 24]), 2)
-    whole = EpochSampler(24, 4, shards=shards).order(0)
-    ranks = [EpochSampler(24, 2, rank=r, world=2, shards=shards).batches(0) for r in range(2)]
+    whole = StepPlan(24, 4, shards=shards).order(0)
+    plan = StepPlan(24, 2, world=2, shards=shards)
+    ranks = [StepSampler(plan, rank).epoch(0) for rank in range(2)]
     joined = [k.index for both in zip(*ranks, strict=True) for keys in both for k in keys]
     assert joined == whole.tolist()
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fluxvla_core.data import PrivateInferenceDataset
-from fluxvla_core.data.preparation import check_statistics, try_preparation
+from fluxvla_core.data.inference_dataset import try_preparation
+from fluxvla_core.data.statistics import check_statistics
 from fluxvla_core.errors import CheckpointError, ConfigError
 
 ROWS = {"mean": [0.0, 1.0], "std": [1.0, 2.0]}

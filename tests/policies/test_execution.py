@@ -14,7 +14,7 @@ from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
 
-from fluxvla_core.policies import cuda_graph, execution  # noqa: E402
+from fluxvla_core.policies import execution  # noqa: E402
 from fluxvla_core.policies.execution import (  # noqa: E402
     KEPT_SHAPES,
     Eager,
@@ -199,17 +199,17 @@ def test_a_chunk_that_continues_another_is_not_replayed() -> None:
 def test_what_does_not_fit_a_recording_is_refused() -> None:
     memory = {"a": torch.zeros(2), "b": torch.zeros(3)}
     with pytest.raises(ValueError, match=r"recorded with \['a', 'b'\], called with \['a'\]"):
-        cuda_graph.copy_into(memory, {"a": torch.ones(2)})
+        execution.copy_into(memory, {"a": torch.ones(2)})
     with pytest.raises(ValueError, match=r"b was recorded as \(3,\) torch.float32, and is \(1,\)"):
-        cuda_graph.copy_into(memory, {"a": torch.ones(2), "b": torch.ones(1)})
+        execution.copy_into(memory, {"a": torch.ones(2), "b": torch.ones(1)})
     assert torch.equal(memory["a"], torch.zeros(2))
-    cuda_graph.copy_into(memory, {"a": torch.ones(2), "b": memory["b"]})
+    execution.copy_into(memory, {"a": torch.ones(2), "b": memory["b"]})
     assert torch.equal(memory["a"], torch.ones(2))
 
 
 def test_memory_of_a_recording_can_be_written_in_any_mode() -> None:
     with torch.inference_mode():
-        memory = cuda_graph.static({"a": torch.zeros(2)})
+        memory = execution.static({"a": torch.zeros(2)})
     memory["a"].copy_(torch.ones(2))
     assert torch.equal(memory["a"], torch.ones(2))
 
@@ -257,7 +257,7 @@ def test_a_graph_needs_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="execution 'graph' needs a GPU, and torch finds none"):
         policy(Steps(), execution="graph")
     with pytest.raises(ConfigError, match="needs a GPU"):
-        cuda_graph.CudaGraph(lambda inputs: inputs, {"x": torch.zeros(1)})
+        execution.CudaGraph(lambda inputs: inputs, {"x": torch.zeros(1)})
 
 
 def test_a_graph_needs_a_model_that_divides_its_answer(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,8 +32,7 @@ AT_HOME = {
 }
 # Modules that a policy imports once it has a model.
 WITH_A_MODEL = {
-    f"policies/{name}.py"
-    for name in ("cuda_graph", "execution", "inference_weights", "roofline", "transfer")
+    f"policies/{name}.py" for name in ("execution", "inference_weights", "roofline", "transfer")
 }
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg, build_vla_from_cfg
-from fluxvla_core.training.footprint import optimizer_bytes
+from fluxvla_core.training.cost import optimizer_bytes
 from fluxvla_core.training.model import ForwardArguments
 from fluxvla_core.training.rehearsal import kept_of
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fluxvla_core.training.resume_checks import changed_settings, changed_statistics
+from fluxvla_core.training.resuming import changed_settings, changed_statistics
 
 
 def tree(**dataset):

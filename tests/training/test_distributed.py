@@ -12,7 +12,8 @@ import torch
 from fluxvla_core.errors import CheckpointError, ConfigError, FluxError, RunFailed
 from fluxvla_core.testing.training import run_ranks
 from fluxvla_core.training import distributed
-from fluxvla_core.training.distributed import World, explain, run_on_rank0, start
+from fluxvla_core.training.distributed import World, run_on_rank0, start
+from fluxvla_core.training.failures import explain
 
 ONE = World(0, 1, 0, torch.device("cpu"))
 TWO = World(1, 2, 1, torch.device("cpu"))
@@ -116,7 +117,7 @@ def test_devices_that_are_not_there_are_refused(monkeypatch):
 
 def test_a_lost_rank_is_explained_and_other_errors_are_not():
     error = RuntimeError("[gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:4009")
-    lost = explain(error, TWO, 12)
+    lost = explain(error, 12, TWO)
     assert isinstance(lost, RunFailed)
     assert str(lost) == (
         "rank 1 of 2 lost another rank during step 12\n"
@@ -124,8 +125,8 @@ def test_a_lost_rank_is_explained_and_other_errors_are_not():
         "([gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:4009)\n"
         "  next: fix what that message names, then run the same command with --resume auto"
     )
-    assert explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"), TWO, 12) is None
-    assert explain(error, ONE, 12) is None
+    assert explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"), 12, TWO) is None
+    assert explain(error, 12, ONE) is None
 
 
 @pytest.mark.parametrize(
@@ -150,7 +151,7 @@ def test_a_lost_rank_is_explained_and_other_errors_are_not():
     ],
 )
 def test_what_gloo_c10d_and_nccl_say_of_a_lost_rank(text):
-    assert explain(RuntimeError(text), TWO, 12) is not None
+    assert explain(RuntimeError(text), 12, TWO) is not None
 
 
 WORKER = "Caught RuntimeError in DataLoader worker process 0.\nOriginal Traceback …\nRuntimeError: "
@@ -166,7 +167,7 @@ WORKER = "Caught RuntimeError in DataLoader worker process 0.\nOriginal Tracebac
     ],
 )
 def test_what_is_of_this_rank_is_not_blamed_on_another(error):
-    assert explain(error, TWO, 12) is None
+    assert explain(error, 12, TWO) is None
 
 
 def interfaces(folder, local_size):

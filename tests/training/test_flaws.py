@@ -17,7 +17,7 @@ import torch
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
-from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.sampler import StepPlan, StepSampler
 from fluxvla_core.testing.training import (
     TinyDataset,
     checkpoint_differences,
@@ -28,7 +28,7 @@ from fluxvla_core.testing.training import (
     unflushed,
 )
 from fluxvla_core.training.distributed import start
-from fluxvla_core.training.rng import rank_seed
+from fluxvla_core.training.state import rank_seed
 
 ROOT = Path(__file__).resolve().parents[2]
 NUMBERS = [
@@ -194,7 +194,7 @@ def test_every_epoch_has_an_order_of_its_own(tmp_path, workers):
 
     from fluxvla_core.data.loader import make_loader
 
-    sampler = EpochSampler(8, 4, seed=3)
+    sampler = StepSampler(StepPlan(8, 4, seed=3))
     loader = iter(make_loader(Watching(8), list, sampler, workers))
     epochs = []
     for _ in range(2):

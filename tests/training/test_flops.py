@@ -18,7 +18,7 @@ from fluxvla_core.testing.training import (
     tiny_config,
     unflushed,
 )
-from fluxvla_core.training.flops import Meter, known_peak, on_meta, training_flops
+from fluxvla_core.training.cost import Meter, known_peak, on_meta, training_flops
 
 
 def batch(n=4):

@@ -12,8 +12,12 @@ from fluxvla_core.training.optimizers import SGD, AdamW
 torch = pytest.importorskip("torch")
 from torch import nn  # noqa: E402
 
-from fluxvla_core.training import footprint, parameters  # noqa: E402
-from fluxvla_core.training.model import checkpoint_activations  # noqa: E402
+from fluxvla_core.training import cost  # noqa: E402
+from fluxvla_core.training.model import (  # noqa: E402
+    checkpoint_activations,
+    nbytes,
+    replicated_layout,
+)
 
 BATCH = {"x": torch.zeros(4, 8, 32), "y": torch.zeros(4, 8, 32)}
 BF16 = torch.bfloat16
@@ -72,8 +76,8 @@ def on_meta(**settings: Any) -> Stack:
 def test_what_autograd_keeps_is_counted_without_memory(dtype: Any) -> None:
     real, again = Stack(), Stack()
     checkpoint_activations(again)
-    kept, left = footprint.kept(real, BATCH, dtype), footprint.kept(again, BATCH, dtype)
-    told = footprint.kept_by_fake(footprint.fake(on_meta()), BATCH, dtype)
+    kept, left = cost.kept(real, BATCH, dtype), cost.kept(again, BATCH, dtype)
+    told = cost.kept_by_fake(cost.fake(on_meta()), BATCH, dtype)
     # The statistics of norms of bf16 inputs are fp32 on a CPU, and bf16 where nothing is computed.
     margin = 0.01 if dtype else 0
     assert told.activations == pytest.approx(kept.activations, rel=margin)
@@ -82,9 +86,7 @@ def test_what_autograd_keeps_is_counted_without_memory(dtype: Any) -> None:
     assert told.batch == kept.batch == 2 * 4 * 8 * 32 * 4
     # In bf16 autocast copies the trained matrices and their biases, but not the norms.
     copied = [p for n, p in real.named_parameters() if p.requires_grad and "norm" not in n]
-    assert (
-        told.weight_copies == kept.weight_copies == (parameters.nbytes(copied) // 2 if dtype else 0)
-    )
+    assert told.weight_copies == kept.weight_copies == (nbytes(copied) // 2 if dtype else 0)
 
 
 def test_what_is_kept_is_counted_by_hand() -> None:
@@ -98,15 +100,15 @@ def test_what_is_kept_is_counted_by_hand() -> None:
         def forward(self, x: Any) -> dict[str, Any]:
             return {"loss": self.second(self.first(x)).square().mean()}
 
-    kept = footprint.kept(One(), {"x": torch.zeros(2, 6)}, None)
+    kept = cost.kept(One(), {"x": torch.zeros(2, 6)}, None)
     assert kept.activations == 4 * (2 * 5 + 2 * 3)
     assert (kept.batch, kept.weight_copies) == (4 * 2 * 6, 0)
 
 
 def test_recomputing_keeps_what_goes_into_units_and_tells_of_the_largest() -> None:
-    kept = footprint.kept_by_fake(footprint.fake(on_meta()), BATCH, None)
-    found = parameters.replicated_layout(on_meta())
-    plain, again = (footprint.footprint(found, kept, 0, False, r) for r in (False, True))
+    kept = cost.kept_by_fake(cost.fake(on_meta()), BATCH, None)
+    found = replicated_layout(on_meta())
+    plain, again = (cost.footprint(found, kept, 0, False, r) for r in (False, True))
     assert (plain.activations, plain.recomputed) == (kept.activations, 0)
     assert (again.activations, again.recomputed) == (kept.recomputed, kept.largest_unit)
     assert kept.recomputed < kept.activations / 5
@@ -115,28 +117,26 @@ def test_recomputing_keeps_what_goes_into_units_and_tells_of_the_largest() -> No
 
 
 def test_a_model_that_decides_by_numbers_cannot_be_counted() -> None:
-    counted = footprint.fake(on_meta(decides="count"))
+    counted = cost.fake(on_meta(decides="count"))
     with pytest.raises(Exception, match="_local_scalar_dense"):
-        footprint.kept_by_fake(counted, BATCH, None)
+        cost.kept_by_fake(counted, BATCH, None)
 
 
 @pytest.mark.parametrize("settings", [AdamW(), AdamW(fused=False), SGD(), SGD(momentum=0.0)])
 def test_the_state_of_an_optimizer(settings: Any) -> None:
     model = Stack()
-    found = parameters.replicated_layout(on_meta())
+    found = replicated_layout(on_meta())
     groups = [{"params": [p], "weight_decay": 0.0} for p in model.parameters() if p.requires_grad]
     optimizer = settings.build(groups, 1e-3)
     model(**BATCH)["loss"].backward()
     optimizer.step()
-    assert footprint.optimizer_bytes(settings.build, found.optimized) == footprint.state_bytes(
-        optimizer
-    )
+    assert cost.optimizer_bytes(settings.build, found.optimized) == cost.state_bytes(optimizer)
 
 
 def test_what_one_process_alone_keeps() -> None:
     model = Stack()
     model(**BATCH)["loss"].backward()
-    found = parameters.replicated_layout(on_meta())
+    found = replicated_layout(on_meta())
     own: Mapping[str, Any] = dict(model.named_parameters())
     assert found.parameters == sum(t.nbytes for t in [*own.values(), model.scale])
     assert found.gradients == sum(p.grad.nbytes for p in own.values() if p.grad is not None)
@@ -144,9 +144,9 @@ def test_what_one_process_alone_keeps() -> None:
 
 
 def test_the_sum_and_the_averages() -> None:
-    found = parameters.replicated_layout(on_meta())
-    kept = footprint.Kept(5, recomputed=2, largest_unit=3, weight_copies=7, batch=11)
-    whole = footprint.footprint(found, kept, 13, True, False)
+    found = replicated_layout(on_meta())
+    kept = cost.Kept(5, recomputed=2, largest_unit=3, weight_copies=7, batch=11)
+    whole = cost.footprint(found, kept, 13, True, False)
     assert whole.averages == found.gradients
     assert whole.total == found.parameters + 2 * found.gradients + 13 + 5 + 7 + 11
     assert whole.to_dict()["total"] == whole.total

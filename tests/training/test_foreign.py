@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
-from fluxvla_core.checkpoints.foreign import check_settings
+from fluxvla_core.checkpoints.foreign import check_settings, formats, read_foreign, telling_families
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, IncompatiblePlugin, SpecMismatch, UsageError
 from fluxvla_core.models import (
@@ -28,7 +28,6 @@ from fluxvla_core.policies.loading import load_policy
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import TinyDataset, tiny_config
 from fluxvla_core.training.export import embodiment_in, export_foreign, import_checkpoint
-from fluxvla_core.training.formats import formats, read_foreign, telling_families
 
 ARM = EmbodimentSpec(
     "arm",
@@ -216,7 +215,7 @@ def test_formats_that_cannot_be_loaded_are_told_once_a_reason(tmp_path, monkeypa
         for name in ("A", "B")
     ]
     known, _ = formats()
-    monkeypatch.setattr("fluxvla_core.training.formats.formats", lambda: (known, broken))
+    monkeypatch.setattr("fluxvla_core.checkpoints.foreign.formats", lambda: (known, broken))
     with pytest.raises(CheckpointError) as error:
         read_foreign(tmp_path)
     assert error.value.cause.count(why) == 1

@@ -25,7 +25,8 @@ from fluxvla_core.testing.training import (
     tiny_config,
     unflushed,
 )
-from fluxvla_core.training.memory import explain, peak_bytes
+from fluxvla_core.training.cost import peak_bytes
+from fluxvla_core.training.failures import explain
 
 CUDA = (
     "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 79.15 GiB of "

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import nn
 
+from fluxvla_core.data.loader import to_device
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.training.batches import to_device
 from fluxvla_core.training.model import ForwardArguments, checkpoint_activations, loss_of
 
 

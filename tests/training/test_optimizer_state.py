@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.training.optimizer_state import named_state, torch_state
+from fluxvla_core.training.model import clip_, decay_groups
 from fluxvla_core.training.optimizers import AdamW
-from fluxvla_core.training.parameters import clip_, decay_groups
+from fluxvla_core.training.state import named_state, torch_state
 
 
 def model():

@@ -10,16 +10,16 @@ from torch import nn
 from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.data import loader as loading
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
-from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.sampler import StepPlan, StepSampler
 from fluxvla_core.data.transforms.images import SCALE
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import differences, unflushed
-from fluxvla_core.training import batches
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
@@ -131,13 +131,13 @@ def leave(monkeypatch):
     """Once called, runs leave images to the device; gives the dtypes that arrive there."""
     arrived = []
 
-    def spy(batch, known=batches.normalized):
+    def spy(batch, known=loading.normalized):
         arrived.append(batch["images"].dtype)
         return known(batch)
 
     def ask():
-        monkeypatch.setattr(batches, "on_device", lambda device: True)
-        monkeypatch.setattr(batches, "normalized", spy)
+        monkeypatch.setattr(loading, "on_device", lambda device: True)
+        monkeypatch.setattr(loading, "normalized", spy)
         return arrived
 
     return ask
@@ -172,8 +172,8 @@ def test_a_run_goes_on_the_other_way_bit_for_bit(roots, tmp_path, leave):
 def test_what_is_left_travels_as_a_quarter_of_the_bytes(roots):
     collator = DictCollator(KEYS, META)
     dataset = build_dataset_from_cfg(table(roots[0]))
-    plain = batches.loader_source(dataset, collator, CPU)
-    left = batches.loader_source(dataset, collator, GPU)
+    plain = loading.loader_source(dataset, collator, CPU)
+    left = loading.loader_source(dataset, collator, GPU)
     assert plain is dataset
     assert isinstance(left, ParquetDataset)
     assert left.get_sample(0, 0)["images"].nbytes * 4 == plain.get_sample(0, 0)["images"].nbytes
@@ -182,10 +182,10 @@ def test_what_is_left_travels_as_a_quarter_of_the_bytes(roots):
 
 def test_a_worker_that_does_not_inherit_reads_it_too(roots):
     """Where processes are not forked, which is Python 3.14's default, a dataset is sent to them."""
-    left = batches.loader_source(
+    left = loading.loader_source(
         build_dataset_from_cfg(mixture(roots)), DictCollator(KEYS, META), GPU
     )
-    keys = [next(iter(EpochSampler(len(left), 4).batches(0)))]
+    keys = [next(iter(StepSampler(StepPlan(len(left), 4)).epoch(0)))]
     loader = make_loader(
         left, DictCollator(KEYS, META), keys, 1, multiprocessing_context="forkserver"
     )
@@ -197,13 +197,13 @@ def test_a_worker_that_does_not_inherit_reads_it_too(roots):
 def test_a_mixture_leaves_all_or_nothing(roots):
     collator = DictCollator(KEYS, META)
     whole = build_dataset_from_cfg(mixture(roots))
-    left = batches.loader_source(whole, collator, GPU)
+    left = loading.loader_source(whole, collator, GPU)
     assert isinstance(left, DistributedRepeatingDataset)
     assert {left[i]["images"].dtype for i in range(len(left))} == {np.dtype(np.uint8)}
     assert {whole[i]["images"].dtype for i in range(len(whole))} == {np.dtype(np.float32)}
     strange = table(roots[1], NORMALIZE, lambda sample: sample)
     half = DistributedRepeatingDataset([table(roots[0]), strange])
-    assert batches.loader_source(half, collator, GPU) is half
+    assert loading.loader_source(half, collator, GPU) is half
 
 
 class Cropping(DictCollator):
@@ -229,9 +229,9 @@ class Renamed(DictCollator):
 )
 def test_only_the_cores_collator_is_given_what_is_left(roots, collator, leaves):
     dataset = build_dataset_from_cfg(table(roots[0]))
-    assert (batches.loader_source(dataset, collator, GPU) is not dataset) is leaves
+    assert (loading.loader_source(dataset, collator, GPU) is not dataset) is leaves
 
 
 def test_a_dataset_that_knows_nothing_of_it_is_read_as_it_is():
     dataset = [{"images": np.zeros((3, 2, 2), np.float32)}]
-    assert batches.loader_source(dataset, DictCollator(KEYS), GPU) is dataset
+    assert loading.loader_source(dataset, DictCollator(KEYS), GPU) is dataset

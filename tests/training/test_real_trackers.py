@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.training import trackers
-from fluxvla_core.training.trackers import open_tracker
+from fluxvla_core.training import metrics
+from fluxvla_core.training.metrics import open_tracker
 
 
 class Said(SilentReporter):
@@ -66,7 +66,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from fluxvla_core.contracts.reporter import SilentReporter
-from fluxvla_core.training.trackers import open_tracker
+from fluxvla_core.training.metrics import open_tracker
 
 class Loud(SilentReporter):
     def warn(self, text):
@@ -128,4 +128,4 @@ def test_each_is_an_extra_of_its_own(name):
     extras = importlib.metadata.metadata("fluxvla-core").get_all("Provides-Extra")
     assert extras is not None
     assert name in extras
-    assert trackers._KINDS[name][1] == name
+    assert metrics._KINDS[name][1] == name

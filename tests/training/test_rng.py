@@ -7,7 +7,7 @@ import random
 import numpy as np
 import torch
 
-from fluxvla_core.training.rng import rank_seed, rng_state, seed_all, set_rng_state
+from fluxvla_core.training.state import rank_seed, rng_state, seed_all, set_rng_state
 
 
 def draw():

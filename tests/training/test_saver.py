@@ -41,13 +41,13 @@ def run(work_dir, **settings):
 def test_it_saves_the_moment_however_long_the_copy_takes(tmp_path, monkeypatch):
     """The next step's forward pass runs during the copy; its optimizer waits for it."""
     at_once = run(tmp_path / "at once", async_save=False)
-    copy = saving.Saver._copy
+    copy = saving.Saver._host_copy
 
-    def slow(self, place, tensor):
+    def slow(self, *place_and_tensor):
         time.sleep(0.01)
-        return copy(self, place, tensor)
+        return copy(self, *place_and_tensor)
 
-    monkeypatch.setattr(saving.Saver, "_copy", slow)
+    monkeypatch.setattr(saving.Saver, "_host_copy", slow)
     beside = run(tmp_path / "beside")
     assert len(at_once) == len(beside) == 3
     for a, b in zip(at_once, beside, strict=True):
@@ -116,10 +116,10 @@ def test_the_last_save_that_fails_fails_the_run(tmp_path, monkeypatch):
 
 
 def test_what_is_no_error_of_the_disk_fails_the_run_too(tmp_path, monkeypatch):
-    def no_memory(self, place, tensor):
+    def no_memory(self, *place_and_tensor):
         raise MemoryError("cannot allocate 7 bytes")
 
-    monkeypatch.setattr(saving.Saver, "_copy", no_memory)
+    monkeypatch.setattr(saving.Saver, "_host_copy", no_memory)
     with pytest.raises(RunFailed, match="of step 2 could not be saved: MemoryError: cannot alloc"):
         run(tmp_path)
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.training.lr_scheduler import ScheduledLR
-from fluxvla_core.training.schedule import TYPES, make_schedule
+from fluxvla_core.training.optimizers import TYPES, ScheduledLR, make_schedule
 
 
 def rates(kind, total=10, lr=1.0, **more):

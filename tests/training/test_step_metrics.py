@@ -11,7 +11,7 @@ from fluxvla_core.errors import RunFailed
 from fluxvla_core.testing.training import run_ranks
 from fluxvla_core.training import distributed, step_metrics
 from fluxvla_core.training.distributed import World
-from fluxvla_core.training.step_metrics import StepMetrics
+from fluxvla_core.training.step_metrics import Step, StepMetrics
 
 ONE = World(0, 1, 0, torch.device("cpu"))
 
@@ -19,7 +19,7 @@ ONE = World(0, 1, 0, torch.device("cpu"))
 def add(window, step, *losses, norm=1.0, ids=None, wait=0.0):
     tensors = [torch.tensor(loss) for loss in losses]
     numbers = ids or [torch.tensor([10 * step + i]) for i in range(len(losses))]
-    window.add(step, 0.5, 1e-3, tensors, numbers, torch.tensor(norm), 8, wait)
+    window.add(Step(step, 0.5, 1e-3, tensors, numbers, torch.tensor(norm), 8, wait))
 
 
 def test_losses_are_means_over_the_batches_of_a_step():
@@ -27,8 +27,9 @@ def test_losses_are_means_over_the_batches_of_a_step():
     add(window, 1, 1.0, 3.0)
     add(window, 2, 5.0, 6.0, norm=2.0)
     first, second = window.fetch()
-    assert (first.step, first.loss, first.grad_norm, first.lr) == (1, 2.0, 1.0, 1e-3)
-    assert (second.step, second.loss, second.grad_norm) == (2, 5.5, 2.0)
+    wanted = {"epoch": 0.5, "lr": 1e-3}
+    assert {**first, "global_step": 1, "loss": 2.0, "grad_norm": 1.0, **wanted} == first
+    assert {**second, "global_step": 2, "loss": 5.5, "grad_norm": 2.0, **wanted} == second
     assert window.fetch() == []
 
 
@@ -49,13 +50,14 @@ def test_times_add_up_and_a_save_is_left_out(monkeypatch):
         add(window, step, 1.0, wait=wait)
     clock.now += 1.0  # what fetching takes is the last step's
     first, second = window.fetch()
-    assert (first.step_time, first.data_wait, first.samples_per_s) == (2.0, 0.25, 4.0)
-    assert (second.step_time, second.data_wait, second.samples_per_s) == (5.0, 0.0, 1.6)
+    keys = ("step_time", "data_wait", "samples_per_s")
+    assert [first[key] for key in keys] == [2.0, 0.125, 4.0]
+    assert [second[key] for key in keys] == [5.0, 0.0, 1.6]
     clock.now += 100.0
     window.restart_clock()
     clock.now += 2.0
     add(window, 3, 1.0)
-    assert window.fetch()[0].step_time == 2.0
+    assert window.fetch()[0]["step_time"] == 2.0
 
 
 class OnDevice(torch.Tensor):
@@ -82,20 +84,20 @@ def test_a_host_that_runs_ahead_of_its_device_tells_the_devices_time(monkeypatch
         OnDevice.done = max(OnDevice.done, clock.now) + 10.0
         loss = torch.tensor(1.0).as_subclass(OnDevice)
         wait = 1.0 if step == 1 else 0.0
-        window.add(step, 0.0, 1e-3, [loss], [None], torch.tensor(1.0), 8, wait)
+        window.add(Step(step, 0.0, 1e-3, [loss], [None], torch.tensor(1.0), 8, wait))
         if step % 4 == 0:
             found += window.fetch()
             window.restart_clock()  # as after a save
-    assert sum(record.step_time for record in found) == clock.now == 82.0
-    assert {record.step_time for record in found} == {10.25}
-    assert {record.samples_per_s for record in found} == {8 / 10.25}
-    assert [record.data_wait for record in found] == [0.25] * 4 + [0.0] * 4
+    assert sum(record["step_time"] for record in found) == clock.now == 82.0
+    assert {record["step_time"] for record in found} == {10.25}
+    assert {record["samples_per_s"] for record in found} == {8 / 10.25}
+    assert [record["data_wait"] for record in found] == [0.25 / 10.25] * 4 + [0.0] * 4
 
 
 def test_a_strategy_that_tells_no_norm_has_none():
     window = StepMetrics(ONE)
-    window.add(1, 0.0, 1e-3, [torch.tensor(1.0)], [None], None, 8, 0.0)
-    assert window.fetch()[0].grad_norm is None
+    window.add(Step(1, 0.0, 1e-3, [torch.tensor(1.0)], [None], None, 8, 0.0))
+    assert window.fetch()[0]["grad_norm"] is None
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -145,7 +147,7 @@ def two_ranks(folder):
     try:
         window.fetch()
     except RunFailed as error:
-        (folder / f"{world.rank}").write_text(f"{record.loss}\n{error.what}")
+        (folder / f"{world.rank}").write_text(f"{record['loss']}\n{error.what}")
     distributed.stop(world)
 
 
@@ -160,17 +162,21 @@ def test_losses_are_of_all_ranks_and_every_rank_hears_of_another_ones_nan(tmp_pa
     )
 
 
+def by_dataset(record):
+    return {key.removeprefix("loss/"): v for key, v in record.items() if key.startswith("loss/")}
+
+
 def test_the_loss_of_each_dataset():
     """Of three datasets one has no sample in the second step."""
     window = StepMetrics(ONE, {"cubes": 10, "cups": 5, "plates": 100})
     losses = [torch.tensor([1.0, 3.0, 5.0]), torch.tensor([7.0, 9.0])]
     ids = [torch.tensor([0, 9, 10]), torch.tensor([14, 15])]
     means = [part.mean() for part in losses]
-    window.add(1, 0.0, 1e-3, means, ids, None, 5, 0.0, losses)
-    window.add(2, 0.0, 1e-3, means[:1], ids[:1], None, 3, 0.0, losses[:1])
-    window.add(3, 0.0, 1e-3, means[:1], ids[:1], None, 3, 0.0, [None])
-    window.add(4, 0.0, 1e-3, means[:1], [None], None, 3, 0.0, losses[:1])
-    found = [record.by_dataset for record in window.fetch()]
+    window.add(Step(1, 0.0, 1e-3, means, ids, None, 5, 0.0, losses))
+    window.add(Step(2, 0.0, 1e-3, means[:1], ids[:1], None, 3, 0.0, losses[:1]))
+    window.add(Step(3, 0.0, 1e-3, means[:1], ids[:1], None, 3, 0.0, [None]))
+    window.add(Step(4, 0.0, 1e-3, means[:1], [None], None, 3, 0.0, losses[:1]))
+    found = [by_dataset(record) for record in window.fetch()]
     assert found == [
         {"cubes": 2.0, "cups": 6.0, "plates": 9.0},
         {"cubes": 2.0, "cups": 5.0},
@@ -182,5 +188,5 @@ def test_the_loss_of_each_dataset():
 def test_one_dataset_has_no_loss_of_its_own():
     window = StepMetrics(ONE, {"cubes": 10})
     each = torch.tensor([1.0])
-    window.add(1, 0.0, 1e-3, [each.mean()], [torch.tensor([0])], None, 1, 0.0, [each])
-    assert window.fetch()[0].by_dataset == {}
+    window.add(Step(1, 0.0, 1e-3, [each.mean()], [torch.tensor([0])], None, 1, 0.0, [each]))
+    assert by_dataset(window.fetch()[0]) == {}

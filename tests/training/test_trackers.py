@@ -12,7 +12,7 @@ import pytest
 
 from fluxvla_core.contracts.reporter import SilentReporter
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.training.trackers import check_trackers, open_tracker
+from fluxvla_core.training.metrics import check_trackers, open_tracker
 
 
 class Said(SilentReporter):

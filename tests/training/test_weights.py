@@ -14,7 +14,7 @@ from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.testing.training import run_ranks, tiny_config, train
-from fluxvla_core.training.ema import Ema
+from fluxvla_core.training.state import Ema
 from fluxvla_core.training.weights import (
     check_model_tensors,
     left_out,

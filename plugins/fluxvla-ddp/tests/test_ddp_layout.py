@@ -7,7 +7,7 @@ import torch
 from fluxvla_core import build_runner_from_cfg, build_vla_from_cfg
 from fluxvla_core.build import RunContext
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config
-from fluxvla_core.training.footprint import fake, kept, kept_by_fake, optimizer_bytes, state_bytes
+from fluxvla_core.training.cost import fake, kept, kept_by_fake, optimizer_bytes, state_bytes
 from fluxvla_core.training.model import ForwardArguments
 
 

@@ -15,7 +15,7 @@ from fluxvla_core.errors import RunFailed
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config
 from fluxvla_core.training import distributed
-from fluxvla_core.training.progress import Progress
+from fluxvla_core.training.state import Progress
 from fluxvla_core.training.stop import StopRequest
 from fluxvla_core.training.trainer import Trainer
 

@@ -8,7 +8,7 @@ import torch
 from fluxvla_core import build_runner_from_cfg, build_vla_from_cfg
 from fluxvla_core.build import RunContext
 from fluxvla_core.testing.training import KEYS, TinyDataset, run_ranks, tiny_config
-from fluxvla_core.training.footprint import optimizer_bytes
+from fluxvla_core.training.cost import optimizer_bytes
 from fluxvla_core.training.model import ForwardArguments
 
 # Odd widths, of which the second process has less; a parameter of one element, tied weights.

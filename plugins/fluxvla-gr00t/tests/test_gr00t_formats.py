@@ -12,10 +12,10 @@ from fluxvla_gr00t.formats import GR00TN15Format, GR00TN17Format
 from fluxvla_gr00t.lerobot_format import LeRobotGR00TFormat
 from safetensors.torch import load_file, save_file
 
+from fluxvla_core.checkpoints.foreign import read_foreign
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, UsageError
 from fluxvla_core.models import load_policy
-from fluxvla_core.training.formats import read_foreign
 from tests.oracles import fill
 
 from . import published

@@ -17,7 +17,7 @@ from fluxvla_core.testing.training import (
     run_ranks,
     tiny_config,
 )
-from fluxvla_core.training.footprint import fake, kept, kept_by_fake
+from fluxvla_core.training.cost import fake, kept, kept_by_fake
 from tests.oracles import fill
 
 from .gr00t_sizes import PLACE, TINY_N15, TINY_N17

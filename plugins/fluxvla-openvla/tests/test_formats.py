@@ -10,10 +10,10 @@ import torch
 from fluxvla_openvla.formats import OpenVLAFormat
 
 from fluxvla_core import load_policy
+from fluxvla_core.checkpoints.foreign import read_foreign
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, ConfigError, UsageError
 from fluxvla_core.operators import Camera, EmbodimentSpec, Joint
-from fluxvla_core.training.formats import read_foreign
 
 from . import published
 

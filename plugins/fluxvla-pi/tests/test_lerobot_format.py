@@ -13,6 +13,7 @@ from fluxvla_pi.names import LEROBOT
 from safetensors.torch import load_file, save_file
 
 from fluxvla_core import build_runner_from_cfg
+from fluxvla_core.checkpoints.foreign import read_foreign
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import PrivateInferenceDataset
 from fluxvla_core.errors import CheckpointError, ConfigError, UsageError
@@ -20,7 +21,6 @@ from fluxvla_core.models import load_policy
 from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import OneProcessRunner
 from fluxvla_core.training.export import export_foreign
-from fluxvla_core.training.formats import read_foreign
 from tests.policies.benched import DIVIDED, stages_of
 
 from .oracles import pi_inputs

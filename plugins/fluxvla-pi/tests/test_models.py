@@ -9,7 +9,7 @@ from fluxvla_pi.pi0 import PI0FlowMatching
 from fluxvla_pi.pi05 import PI05FlowMatching
 
 from fluxvla_core.errors import ConfigError, DataError
-from fluxvla_core.training.footprint import fake, kept, kept_by_fake
+from fluxvla_core.training.cost import fake, kept, kept_by_fake
 
 from .oracles.pi_inputs import ACTIONS, BATCH, HORIZON, SIZES
 from .tiny import acting_batch, model_of, relative, training_batch

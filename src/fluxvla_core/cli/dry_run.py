@@ -12,7 +12,7 @@ from fluxvla_core.cli.plan import Plan
 if TYPE_CHECKING:
     from fluxvla_core.errors import FluxError
     from fluxvla_core.spec.embodiment import EmbodimentSpec
-    from fluxvla_core.training.footprint import Footprint
+    from fluxvla_core.training.cost import Footprint
     from fluxvla_core.training.rehearsal import Rehearsal
 
 _GB = 1e9
@@ -217,7 +217,7 @@ def _value(one: Footprint, name: str) -> int:
 
 
 def _left_out() -> tuple[str, ...]:
-    from fluxvla_core.training.footprint import LEFT_OUT
+    from fluxvla_core.training.cost import LEFT_OUT
 
     return LEFT_OUT
 

@@ -119,7 +119,7 @@ def _driven(plan: Plan, build: Any, context: Any, own_records: bool) -> tuple[An
         ranks.mark_started(plan.work_dir)
         return runner.run(dataset), TrainRunner.adapt(runner).late_stop
     except (RuntimeError, MemoryError, OSError) as error:
-        from fluxvla_core.training.memory import explain
+        from fluxvla_core.training.failures import explain
 
         known = explain(error)
         if known is None:

@@ -15,8 +15,9 @@ from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.transforms.images import stack_images
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.data.transforms.state_action import load_statistics
-from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.errors import ConfigError, DataError, located
 
+_INSTRUCTION = "go"  # as short as any
 _KEYS = ("images", "img_masks", "lang_tokens", "lang_masks", "states", "embodiment_ids")
 
 
@@ -121,3 +122,34 @@ def _state(observation: Mapping[str, Any]) -> npt.NDArray[np.float32]:
     if state.ndim != 1 or not np.isfinite(state).all():
         raise DataError(f"'qpos' must be one row of finite numbers, got {state.tolist()}")
     return state
+
+
+def try_preparation(
+    prepare: Callable[[Mapping[str, Any]], Any],
+    denormalize: Callable[[Mapping[str, Any]], Any],
+    cameras: Mapping[str, tuple[int, int]],
+    state_dim: int,
+    chunk: tuple[int, int],
+    where: str,
+) -> None:
+    """Prepare a blank observation, and scale a chunk of zeros back.
+
+    What transforms and statistics refuse (a number of images, a width, a statistic that is not
+    there) is told at once, and with the checkpoint's name, not when the robot asks the first time.
+
+    Args:
+        prepare, denormalize: of a ``LocalPolicy``.
+        cameras: name -> height and width of its images.
+        state_dim: numbers of a state.
+        chunk: actions, and numbers of each.
+        where: the checkpoint.
+
+    Raises:
+        FluxError: what they raise.
+    """
+    states = np.zeros(state_dim, np.float32)
+    images = {name: np.zeros((*size, 3), np.uint8) for name, size in cameras.items()}
+    observation = {"qpos": states, "images": images, "task_description": _INSTRUCTION}
+    with located(where):
+        prepare(observation)
+        denormalize({"action": np.zeros((1, *chunk), np.float32), "states": states})

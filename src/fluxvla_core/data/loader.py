@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,13 +22,19 @@ from fluxvla_core.data.sampler import (
     drop_kept_normal,
     global_generators,
 )
-from fluxvla_core.data.transforms.images import SCALE
+from fluxvla_core.data.transforms.images import SCALE, normalized
+from fluxvla_core.data.transforms.pipeline import deferring
 from fluxvla_core.errors import ConfigError, DataError, FluxError
 from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
+
+if TYPE_CHECKING:
+    import torch
 
 # Of malloc.h, and bytes: the largest piece that comes from the heap, and what the heap may keep.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _LARGE, _KEPT = 32 << 20, 1 << 30
+IDS = "sample_ids"
+"""The key of a batch's sample numbers."""
 _END_S = 1.0  # between the end of a connection and that of the process that had it
 
 
@@ -155,6 +161,36 @@ def make_loader(
         generator=torch.Generator().manual_seed(0),
     )
     return Loader(inner)
+
+
+def on_device(device: torch.device) -> bool:
+    """Whether images are normalised there: it saves three quarters of what is copied to a GPU."""
+    return device.type == "cuda"
+
+
+def loader_source(dataset: Any, collator: Any, device: torch.device) -> Any:
+    """``dataset`` as the loader reads it: on a GPU, images are normalised there by ``to_device``.
+
+    With a collator that is not ours everything is normalised in the workers: it may look at images.
+    """
+    stacks = type(collator).__call__ is DictCollator.__call__ and "images" in collator.keys
+    found = deferring(dataset) if on_device(device) and stacks else None
+    return dataset if found is None else found
+
+
+def to_device(batch: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
+    """Tensors of a batch on ``device``; from pinned memory the copy overlaps with computing.
+
+    Images are normalised there if :func:`loader_source` has left that to the device.
+    """
+    from torch import Tensor
+
+    return normalized(
+        {
+            key: value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
+            for key, value in batch.items()
+        }
+    )
 
 
 def _init_worker(worker: int) -> None:

@@ -29,7 +29,7 @@ class DistributedRepeatingDataset(Dataset):
     An epoch is ``samples_per_epoch`` places; each dataset has its share of them, exactly. Epoch
     after epoch a dataset is gone through in rounds: each of its samples once, in an order of its
     own, before any of them a second time. A sample that comes twice in an epoch is augmented
-    differently each time. Ranks and workers do not matter: ``EpochSampler`` shares places out.
+    differently each time. Ranks and workers do not matter: ``StepSampler`` shares places out.
 
     Datasets with the same ``statistic_name`` are of one robot and share statistics: those of all
     their frames together, exactly. Datasets of another robot need another ``statistic_name``.

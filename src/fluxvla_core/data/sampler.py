@@ -1,8 +1,9 @@
-"""Shuffling, batches per rank, and random number generators: functions of (seed, epoch, index).
+"""The order of samples, and random number generators: functions of (seed, epoch, index).
 
-One permutation per epoch is cut into global batches of ``batch_size * world`` samples, and rank
-``r`` takes the ``r``-th part of each. The stream of samples is therefore the same for every world
-size, and a run resumes at a position instead of replaying what it has seen.
+An optimizer step uses ``batch_size * accumulation * world`` consecutive samples of the epoch's
+order, whatever they are split into: a run of eight processes, a run of one with eight-fold
+accumulation and one with a batch eight times as big see the same samples at the same step. A run
+resumes at a position in samples instead of replaying what it has seen.
 
 A sample's noise follows from (seed, epoch, index) and an epoch's order from (seed, epoch), so
 neither the number of ranks, nor the number of workers, nor a restart changes either. Philox is a
@@ -19,12 +20,13 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numpy.random.mtrand import get_bit_generator, set_bit_generator
 
+from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.errors import ConfigError
 
 Ints = npt.NDArray[np.int64]
@@ -41,89 +43,6 @@ class SampleKey:
 
     epoch: int
     index: int
-
-
-class Position(NamedTuple):
-    """Where this rank continues: ``batch`` batches of ``epoch`` have been used already."""
-
-    epoch: int
-    batch: int
-
-
-class EpochSampler:
-    """Yields batches of :class:`SampleKey` for one rank, epoch after epoch, without end.
-
-    An epoch's incomplete last global batch is filled up with the first samples of the same epoch's
-    order, so that every sample is seen, every rank has equally many full batches, and no rank waits
-    for another.
-
-    Args:
-        length: number of samples in the dataset.
-        batch_size: samples per rank and batch.
-        seed: with the epoch, all that the order depends on.
-        rank, world: this process and how many there are.
-        shuffle: False keeps the dataset's own order in every epoch.
-        start: the first position that is yielded; the beginning of epoch 0 by default.
-        shards: mix a few episodes at a time instead of all samples.
-
-    Raises:
-        ConfigError: the dataset or a batch is empty.
-    """
-
-    def __init__(
-        self,
-        length: int,
-        batch_size: int,
-        seed: int = DEFAULT_SEED,
-        rank: int = 0,
-        world: int = 1,
-        shuffle: bool = True,
-        start: Position | None = None,
-        shards: EpisodeShards | None = None,
-    ) -> None:
-        if length < 1:
-            raise ConfigError("the dataset holds no samples")
-        if batch_size < 1:
-            raise ConfigError(f"batch size must be at least 1, got {batch_size}")
-        if not 0 <= rank < world:
-            raise ConfigError(f"rank {rank} is not among {world} processes")
-        self.length = length
-        self.batch_size = batch_size
-        self.seed = seed
-        self.rank = rank
-        self.world = world
-        self.shuffle = shuffle
-        self.start = start or Position(0, 0)
-        self.shards = shards
-
-    @property
-    def global_batch(self) -> int:
-        """Samples in one batch of all ranks together."""
-        return self.batch_size * self.world
-
-    @property
-    def batches_per_epoch(self) -> int:
-        return -(-self.length // self.global_batch)
-
-    def order(self, epoch: int) -> npt.NDArray[np.int64]:
-        """Indices of the whole epoch over all ranks: ``(batches_per_epoch * global_batch,)``."""
-        if self.shuffle:
-            order = epoch_order(self.length, self.seed, epoch, self.shards)
-        else:
-            order = np.arange(self.length)
-        return np.resize(order, self.batches_per_epoch * self.global_batch).astype(np.int64)
-
-    def batches(self, epoch: int, start: int = 0) -> Iterator[list[SampleKey]]:
-        """This rank's batches of one epoch, from the ``start``-th on."""
-        cut = self.order(epoch).reshape(self.batches_per_epoch, self.world, self.batch_size)
-        for indices in cut[start:, self.rank].tolist():
-            yield [SampleKey(epoch, index) for index in indices]
-
-    def __iter__(self) -> Iterator[list[SampleKey]]:
-        epoch, batch = self.start
-        while True:
-            yield from self.batches(epoch, batch)
-            epoch, batch = epoch + 1, 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +82,142 @@ def epoch_order(length: int, seed: int, epoch: int, shards: EpisodeShards | None
         samples = np.concatenate([np.arange(starts[e], shards.ends[e]) for e in chosen])
         parts.append(rng.permutation(samples))
     return np.concatenate(parts)
+
+
+@dataclass(frozen=True)
+class Cursor:
+    """``samples`` of the order of ``epoch`` have been used; both count from 0."""
+
+    epoch: int = 0
+    samples: int = 0
+
+
+@dataclass(frozen=True)
+class StepPlan:
+    """Cuts an epoch of ``length`` samples into steps.
+
+    Args:
+        length: samples in the dataset.
+        batch_size: samples per rank and micro-batch.
+        accumulation: micro-batches per step.
+        world: number of ranks.
+        seed: with the epoch, all that the order depends on.
+        shards: mix a few episodes at a time instead of all samples.
+        shuffle: False keeps the dataset's own order in every epoch.
+    """
+
+    length: int
+    batch_size: int
+    accumulation: int = 1
+    world: int = 1
+    seed: int = DEFAULT_SEED
+    shards: EpisodeShards | None = None
+    shuffle: bool = True
+
+    @property
+    def step_samples(self) -> int:
+        """Samples that all ranks together use in one step."""
+        return self.batch_size * self.accumulation * self.world
+
+    @property
+    def shuffle_episodes(self) -> int | None:
+        """Episodes that are mixed at a time; None where all samples are."""
+        return self.shards.together if self.shards is not None else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its part of ``trainer.json``, as JSON values."""
+        return {
+            "seed": self.seed,
+            "n_train_examples": self.length,
+            "step_samples": self.step_samples,
+            "world_size": self.world,
+            "shuffle_episodes": self.shuffle_episodes,
+        }
+
+    def order(self, epoch: int) -> Ints:
+        """``(length,)`` indices of all samples, in the order of ``epoch``."""
+        if not self.shuffle:
+            return np.arange(self.length)
+        return epoch_order(self.length, self.seed, epoch, self.shards)
+
+    @property
+    def steps_per_epoch(self) -> int:
+        return self.steps_left(Cursor())
+
+    def steps_left(self, cursor: Cursor) -> int:
+        """Steps from ``cursor`` to the end of its epoch; the last one is filled up."""
+        return -(-(self.length - cursor.samples) // self.step_samples)
+
+    def total_steps(self, max_steps: int | None, max_epochs: int | None) -> int:
+        """Steps of a whole run, which ends by either number."""
+        return max_steps or self.steps_per_epoch * (max_epochs or 0)
+
+    def run_steps_left(
+        self, step: int, cursor: Cursor, max_steps: int | None, max_epochs: int | None
+    ) -> int:
+        """Steps to the end of a run that has done ``step`` of them and stands at ``cursor``."""
+        if max_steps is not None:
+            return max(0, max_steps - step)
+        epochs = (max_epochs or 0) - cursor.epoch
+        after = (epochs - 1) * self.steps_per_epoch
+        return self.steps_left(cursor) + after if epochs > 0 else 0
+
+    def after_step(self, cursor: Cursor) -> Cursor:
+        """Where one step leads; past the last sample the next epoch begins."""
+        samples = cursor.samples + self.step_samples
+        if samples >= self.length:
+            return Cursor(cursor.epoch + 1, 0)
+        return Cursor(cursor.epoch, samples)
+
+
+def episode_shards(dataset: Any, together: int | None, where: str | None) -> EpisodeShards | None:
+    """Shards of ``dataset`` by ``shuffle_episodes``: ``together`` episodes at a time, or None.
+
+    Raises:
+        ConfigError: the dataset does not say where its episodes end.
+    """
+    if together is None:
+        return None
+    ends = Dataset.adapt(dataset).episode_ends
+    if ends is None:
+        raise ConfigError(
+            f"{type(dataset).__name__} does not say where its episodes end, so "
+            "shuffle_episodes cannot be used with it",
+            where=where,
+            next="--set train_dataloader.shuffle_episodes=None: all samples are then mixed",
+        )
+    return EpisodeShards(ends, together)
+
+
+class StepSampler:
+    """Yields micro-batches of sample keys for one rank, epoch after epoch, from ``start`` on.
+
+    An epoch's last step is filled up with the first samples of the same epoch's order: every sample
+    is used, every rank has equally many full batches, and none waits for another.
+
+    Raises:
+        ConfigError: the dataset is empty.
+    """
+
+    def __init__(self, plan: StepPlan, rank: int = 0, start: Cursor | None = None) -> None:
+        if plan.length < 1:
+            raise ConfigError("the dataset holds no samples")
+        self.plan, self.rank, self.start = plan, rank, start or Cursor()
+
+    def __iter__(self) -> Iterator[list[SampleKey]]:
+        epoch, skip = self.start.epoch, self.start.samples
+        while True:
+            yield from self.epoch(epoch, skip)
+            epoch, skip = epoch + 1, 0
+
+    def epoch(self, epoch: int, skip: int = 0) -> Iterator[list[SampleKey]]:
+        """The micro-batches of one epoch, without its first ``skip`` samples over all ranks."""
+        plan = self.plan
+        steps = plan.steps_left(Cursor(epoch, skip))
+        filled = np.resize(plan.order(epoch), skip + steps * plan.step_samples)[skip:]
+        cut = filled.reshape(steps * plan.accumulation, plan.world, plan.batch_size)
+        for indices in cut[:, self.rank].tolist():
+            yield [SampleKey(epoch, index) for index in indices]
 
 
 def sample_rng(seed: int, epoch: int, index: int) -> np.random.Generator:

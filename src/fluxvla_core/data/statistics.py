@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.errors import ConfigError, nearest
+from fluxvla_core.errors import CheckpointError, ConfigError, nearest
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 LEVELS = 256
@@ -369,3 +369,47 @@ def _numbers(value: Any, name: str, who: str) -> Floats:
             "nor of such lists, one a step"
         )
     return array.astype(np.float64)
+
+
+def check_statistics(statistics: Mapping[str, Mapping[str, Any]], where: str) -> None:
+    """Refuse statistics that are not finite numbers, as many in each row of an entry.
+
+    Args:
+        statistics: ``{"private": {"proprio": {"mean": [...], ...}, "action": {...}}}``.
+        where: the checkpoint.
+
+    Raises:
+        CheckpointError: names the entry, the statistic, and what is wrong with it.
+    """
+    for entries in statistics.values():
+        for key, entry in entries.items():
+            rows = entry.items() if isinstance(entry, Mapping) else ()
+            _check_rows(key, {n: r for n, r in rows if isinstance(r, list | tuple)}, where)
+
+
+def _check_rows(key: str, rows: Mapping[str, Any], where: str) -> None:
+    widths: dict[str, int] = {}
+    for name, row in rows.items():
+        try:
+            numbers = np.asarray(row, np.float64)
+        except (TypeError, ValueError):
+            numbers = np.empty(0)
+        wrong = numbers[~np.isfinite(numbers)]
+        if not numbers.size or wrong.size:
+            found = f"has {wrong[0]}" if wrong.size else f"is {str(row)[:60]}"
+            raise CheckpointError(
+                f"the statistics' {name!r} of {key!r} {found}; finite numbers are expected",
+                where=where,
+                cause="they were computed from data with gaps, or the file is damaged",
+                next="take the statistics of the training's data, or compute them again",
+            )
+        widths[name] = int(numbers.shape[-1])
+    first = next(iter(widths), "")
+    other = next((name for name in widths if widths[name] != widths[first]), None)
+    if other is not None:
+        raise CheckpointError(
+            f"the statistics of {key!r} have {widths[first]} dimensions in {first!r}, "
+            f"{widths[other]} in {other!r}",
+            where=where,
+            cause="the file was changed, or joined of two robots'",
+        )

@@ -247,11 +247,11 @@ def peak_tflops(device: str, precision: str, given: float | None) -> tuple[float
         return given, "given"
     import torch
 
-    from fluxvla_core.training import flops
+    from fluxvla_core.training import cost
 
     dtype = torch.bfloat16 if precision == "bf16" else torch.float32
     if torch.device(device).type == "cuda":
-        known = flops.known_peak(torch.cuda.get_device_name(device), dtype)
+        known = cost.known_peak(torch.cuda.get_device_name(device), dtype)
         if known is not None:
             return known, "its maker's"
     return _measured_tflops(device, dtype), f"a product of two {_MATRIX} x {_MATRIX} matrices"

@@ -5,6 +5,23 @@ its answer (``VLA.observe``, ``VLA.denoise``) is timed in two parts, and can be 
 denoising steps are then one graph, and what comes before them is another one where the model says
 that it may be. Copies between host and device go through pinned memory that is kept, and nobody
 waits for them; clocks take the seconds of an answer's parts without waiting either.
+
+A step of a denoising loop is a hundred and more small kernels, each of which takes a GPU less time
+than it takes the host to launch it. A graph launches them all at once. After torch's notes on CUDA
+graphs:
+
+- memory is fixed: inputs are copied into buffers that the graph reads, outputs lie in memory that
+  it writes, until the next replay;
+- before the capture the function runs on a side stream, so that libraries have allocated their
+  workspaces and chosen their algorithms;
+- the graph's memory is a pool of its own;
+- what runs in other threads of the process (cameras, recording) does not spoil the capture:
+  ``thread_local``;
+- nothing in the function may wait for the device, or depend on a value; nothing in it draws random
+  numbers (the noise is an input), so that there is no generator state to register.
+
+What captures and what does not is tested on CPUs by ``fluxvla_core.testing.capture.Tape``, which
+has the same interface and replays operation by operation.
 """
 
 from __future__ import annotations
@@ -12,7 +29,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -24,23 +41,113 @@ from torch import Tensor
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.policies.cuda_graph import CudaGraph, Record, Recorded, check_gpu, static
 from fluxvla_core.training.model import compile_units
 
 EXECUTIONS = ("eager", "compiled", "graph")
 KEPT_SHAPES = 4
 """Recordings that are kept, one for each set of shapes; transforms pad, so that one is usual."""
 Batch = Mapping[str, Any]
+Tensors = Mapping[str, Tensor]
+Function = Callable[[Tensors], Tensors]
+WARM_UP = 3
 
 
-class Execution(Protocol):
-    """Answers batches by a model."""
+class Recorded(Protocol):
+    """A function that was recorded with fixed memory."""
 
-    caches_casts: bool
-    """Whether autocast may keep the weights that it has cast, which no capture allows."""
+    @property
+    def inputs(self) -> Tensors:
+        """The memory that it reads."""
 
-    def answer(self, batch: Batch, clock: Clock) -> Tensor:
-        """``predict_action(**batch)``: normalised actions ``(B, T, D)``, until the next call."""
+    @property
+    def outputs(self) -> Tensors:
+        """The memory that it writes."""
+
+    def __call__(self, inputs: Tensors) -> Tensors:
+        """Run it on ``inputs``, of the names, shapes and dtypes of the recording.
+
+        The answer is ``outputs``, which the next call overwrites.
+        """
+
+
+Record = Callable[[Function, Tensors], Recorded]
+"""Records a function with inputs as :func:`static` gives them, or another recording's outputs."""
+
+
+class CudaGraph:
+    """``function`` as it was recorded with ``inputs``.
+
+    Args:
+        function: launches operations on its inputs and on tensors that stay where they are.
+        inputs: the memory that it reads in every replay: see :func:`static`. What another graph
+            writes may be among it.
+
+    Raises:
+        ConfigError: there is no GPU.
+    """
+
+    def __init__(self, function: Function, inputs: Tensors) -> None:
+        check_gpu()
+        self.inputs = dict(inputs)
+        device = next(iter(self.inputs.values())).device
+        with torch.cuda.device(device):
+            side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                for _ in range(WARM_UP):
+                    function(self.inputs)
+            torch.cuda.current_stream().wait_stream(side)
+            self._graph = torch.cuda.CUDAGraph()
+            # ``torch.cuda.graph`` waits for the device and captures on a side stream of its own.
+            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                self.outputs = dict(function(self.inputs))
+
+    def __call__(self, inputs: Tensors) -> Tensors:
+        copy_into(self.inputs, inputs)
+        self._graph.replay()
+        return self.outputs
+
+
+def static(inputs: Tensors) -> dict[str, Tensor]:
+    """Copies of ``inputs``, in memory for recordings; they can be written to in any mode."""
+    with torch.inference_mode(False), torch.no_grad():
+        return {name: value.detach().clone() for name, value in inputs.items()}
+
+
+def copy_into(memory: Tensors, values: Tensors) -> None:
+    """Copy ``values`` to ``memory`` of the same names in few launches; what is there already stays.
+
+    Raises:
+        ValueError: other names, shapes or dtypes.
+    """
+    if memory.keys() != values.keys():
+        raise ValueError(f"recorded with {sorted(memory)}, called with {sorted(values)}")
+    moved = [name for name in memory if values[name] is not memory[name]]
+    for name in moved:
+        have, given = memory[name], values[name]
+        if have.shape != given.shape or have.dtype != given.dtype:
+            raise ValueError(
+                f"{name} was recorded as {tuple(have.shape)} {have.dtype}, and is "
+                f"{tuple(given.shape)} {given.dtype}"
+            )
+    if moved:
+        torch._foreach_copy_(
+            [memory[name] for name in moved], [values[name] for name in moved], non_blocking=True
+        )
+
+
+def check_gpu() -> None:
+    """Refuse where nothing can be captured.
+
+    Raises:
+        ConfigError: there is no GPU.
+    """
+    if not torch.cuda.is_available():
+        raise ConfigError(
+            "execution 'graph' needs a GPU, and torch finds none",
+            cause="CUDA graphs are a property of NVIDIA's GPUs",
+            next="execution='compiled' or 'eager', or device='cuda' on a machine that has one",
+        )
 
 
 class Eager:
@@ -50,19 +157,19 @@ class Eager:
     """
 
     caches_casts = True
+    """Whether autocast may keep the weights that it has cast, which no capture allows."""
 
     def __init__(self, model: Any) -> None:
         self.model = model
         self.parts = Parts.of(model)
 
     def answer(self, batch: Batch, clock: Clock) -> Tensor:
-        """See ``Execution``."""
-        parts = self.parts
-        if parts is None or continues(batch):
+        """``predict_action(**batch)``: normalised actions ``(B, T, D)``, until the next call."""
+        if self.parts is None or continues(batch):
             actions: Tensor = self.model.predict_action(**batch)
             clock.mark("forward")
             return actions
-        seen = self.model.observe(**parts.observation(batch))
+        seen = self.model.observe(**self.parts.observation(batch))
         clock.mark("prefix")
         actions = self.model.denoise(seen, batch["noise"], self.tables())
         clock.mark("denoise")
@@ -85,7 +192,6 @@ class Compiled(Eager):
         self._tables: Mapping[str, Tensor] | None = None
 
     def tables(self) -> Mapping[str, Tensor]:
-        """See ``Eager``."""
         if self._tables is None:
             self._tables = super().tables()
         return self._tables
@@ -116,35 +222,37 @@ class Graphed(Compiled):
             )
         super().__init__(model)
         self._record = record
-        self._recorded: OrderedDict[Any, Recording] = OrderedDict()
+        self._recorded: OrderedDict[Any, tuple[Recorded | None, Recorded]] = OrderedDict()
 
     def answer(self, batch: Batch, clock: Clock) -> Tensor:
-        """See ``Execution``."""
         assert self.parts is not None
         if continues(batch):
             return super().answer(batch, clock)
         observation, noise = self.parts.observation(batch), batch["noise"]
-        key = tuple((n, t.shape, t.dtype) for n, t in sorted(batch.items()) if _tensor(t))
+        key = tuple(
+            (n, t.shape, t.dtype) for n, t in sorted(batch.items()) if isinstance(t, Tensor)
+        )
         if key not in self._recorded:
             self._recorded[key] = self._new(observation, noise)
             if len(self._recorded) > KEPT_SHAPES:
                 self._recorded.popitem(last=False)
         self._recorded.move_to_end(key)
-        recording = self._recorded[key]
-        seen = recording.observe(observation) if recording.observe else self._observe(observation)
+        observe, denoise = self._recorded[key]
+        seen = (observe or self._observe)(observation)
         clock.mark("prefix")
-        actions = recording.denoise({**seen, _NOISE: noise})[_NOISE]
+        actions = denoise({**seen, _NOISE: noise})[_NOISE]
         clock.mark("denoise")
         return actions
 
-    def _observe(self, observation: Batch) -> Mapping[str, Tensor]:
-        seen: Mapping[str, Tensor] = self.model.observe(**observation)
+    def _observe(self, observation: Batch) -> Tensors:
+        seen: Tensors = self.model.observe(**observation)
         return seen
 
-    def _new(self, observation: Mapping[str, Tensor], noise: Tensor) -> Recording:
+    def _new(self, observation: Tensors, noise: Tensor) -> tuple[Recorded | None, Recorded]:
+        """Record ``observe``, if the model allows it, and ``denoise``, which reads its memory."""
         tables = self.tables()
 
-        def denoise(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        def denoise(inputs: Tensors) -> Tensors:
             seen = {name: value for name, value in inputs.items() if name != _NOISE}
             return {_NOISE: self.model.denoise(seen, inputs[_NOISE], tables)}
 
@@ -154,20 +262,7 @@ class Graphed(Compiled):
             seen: Mapping[str, Tensor] = observe.outputs
         else:
             seen = static(self._observe(observation))
-        return Recording(observe, self._record(denoise, {**seen, **static({_NOISE: noise})}))
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What was recorded for one set of shapes.
-
-    Args:
-        observe: None where the model's ``observe`` may not be captured.
-        denoise: reads the memory that ``observe`` writes.
-    """
-
-    observe: Recorded | None
-    denoise: Recorded
+        return observe, self._record(denoise, {**seen, **static({_NOISE: noise})})
 
 
 @dataclass(frozen=True)
@@ -188,7 +283,7 @@ class Parts:
         return {name: value for name, value in batch.items() if name in self.names}
 
 
-def execution_of(name: str, model: Any, compiled: bool = False) -> Execution:
+def execution_of(name: str, model: Any, compiled: bool = False) -> Eager:
     """The way ``name`` of :data:`EXECUTIONS` for ``model``.
 
     All but ``eager`` compile its blocks by ``torch.compile``, for the shapes that they meet.
@@ -225,42 +320,30 @@ def continues(batch: Batch) -> bool:
     return "prev_actions" in batch
 
 
-def _tensor(value: Any) -> bool:
-    return isinstance(value, Tensor)
-
-
 _NOISE = "noise"
 
 
-class Clock(Protocol):
-    """Notes the ends of parts."""
-
-    def mark(self, part: str) -> None:
-        """``part`` ends here, where the next one begins."""
-
-    def seconds(self) -> dict[str, float]:
-        """Part -> seconds; once the device has done all that it was given."""
-
-
 class HostClock:
-    """Clock of a device that has done an operation when the call returns."""
+    """Times the parts of an answer, where an operation is done when its call returns."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()
         self._seconds: dict[str, float] = {}
 
     def mark(self, part: str) -> None:
+        """``part`` ends here, where the next one begins."""
         now = time.perf_counter()
         self._seconds[part] = now - self._last
         self._last = now
 
     def seconds(self) -> dict[str, float]:
+        """Part -> seconds; once the device has done all that it was given."""
         return dict(self._seconds)
 
 
 class CudaClock:
-    """Clock of a GPU, by CUDA events: a part that waits for the host to launch operations takes as
-    long as that does."""
+    """As ``HostClock``, by CUDA events: a part that waits for the host to launch operations takes
+    as long as that does."""
 
     def __init__(self) -> None:
         self._marks: list[tuple[str, Any]] = [("", _event())]
@@ -273,16 +356,15 @@ class CudaClock:
         return {part: begun.elapsed_time(ended) / 1e3 for (_, begun), (part, ended) in pairs}
 
 
+Clock = HostClock | CudaClock
+
+
 def clock_of(device: str) -> Clock:
     """A clock that starts now, for ``device``."""
-    import torch
-
     return CudaClock() if torch.device(device).type == "cuda" else HostClock()
 
 
 def _event() -> Any:
-    import torch
-
     event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
     event.record()
     return event

@@ -19,10 +19,9 @@ from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, newest_whol
 from fluxvla_core.config.snapshot import work_dirs_below
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import InferenceDataset, Transform
-from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
+from fluxvla_core.data.inference_dataset import PrivateInferenceDataset, try_preparation
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
-from fluxvla_core.data.preparation import try_preparation
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, located
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, VLAS, Registry
 from fluxvla_core.policies.local import LocalPolicy

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from fluxvla_core.policies.cuda_graph import Function, Tensors, copy_into
+from fluxvla_core.policies.execution import Function, Tensors, copy_into
 
 _aten = torch.ops.aten
 # What waits for the device, by the value that it gives to the host or to the size of its result.

@@ -58,8 +58,8 @@ SCALARS = ("trained", "frozen")
 KEYS = ("states", "actions", "noise", "sample_ids")
 PRELOAD = (
     "fluxvla_core.testing.training",
-    "fluxvla_core.training.lr_scheduler",
-    "fluxvla_core.training.optimizer_state",
+    "fluxvla_core.training.optimizers",
+    "fluxvla_core.training.state",
     "fluxvla_core.training.optimizers",
     "fluxvla_core.training.trainer",
     "torch._dynamo",  # imported by the first optimizer, and slowly

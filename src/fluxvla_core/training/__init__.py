@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from fluxvla_core.training.base_runner import BaseTrainRunner as BaseTrainRunner
     from fluxvla_core.training.distributed import World as World
     from fluxvla_core.training.distributed import broadcast_buffers as broadcast_buffers
+    from fluxvla_core.training.model import Layout as Layout
+    from fluxvla_core.training.model import bare as bare
+    from fluxvla_core.training.model import decay_groups as decay_groups
+    from fluxvla_core.training.model import nbytes as nbytes
+    from fluxvla_core.training.model import refuse_scalars as refuse_scalars
+    from fluxvla_core.training.model import replicated_layout as replicated_layout
+    from fluxvla_core.training.model import trainable as trainable
     from fluxvla_core.training.model import units_of as units_of
-    from fluxvla_core.training.parameters import Layout as Layout
-    from fluxvla_core.training.parameters import bare as bare
-    from fluxvla_core.training.parameters import decay_groups as decay_groups
-    from fluxvla_core.training.parameters import nbytes as nbytes
-    from fluxvla_core.training.parameters import refuse_scalars as refuse_scalars
-    from fluxvla_core.training.parameters import replicated_layout as replicated_layout
-    from fluxvla_core.training.parameters import trainable as trainable
-    from fluxvla_core.training.rng import rng_state as rng_state
-    from fluxvla_core.training.rng import set_rng_state as set_rng_state
+    from fluxvla_core.training.state import rng_state as rng_state
+    from fluxvla_core.training.state import set_rng_state as set_rng_state
     from fluxvla_core.training.weights import left_out as left_out
 
 __getattr__, __dir__, __all__ = _lazy.attach(
@@ -53,8 +53,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         ],
         "fluxvla_core.training.base_runner": ["BaseTrainRunner"],
         "fluxvla_core.training.distributed": ["World", "broadcast_buffers"],
-        "fluxvla_core.training.model": ["units_of"],
-        "fluxvla_core.training.parameters": [
+        "fluxvla_core.training.model": [
             "Layout",
             "bare",
             "decay_groups",
@@ -62,8 +61,9 @@ __getattr__, __dir__, __all__ = _lazy.attach(
             "refuse_scalars",
             "replicated_layout",
             "trainable",
+            "units_of",
         ],
-        "fluxvla_core.training.rng": ["rng_state", "set_rng_state"],
+        "fluxvla_core.training.state": ["rng_state", "set_rng_state"],
         "fluxvla_core.training.weights": ["left_out"],
     },
     deprecated={"share_buffers": "broadcast_buffers", "whole": "replicated_layout"},

@@ -96,8 +96,8 @@ class BaseTrainRunner(Strategy):
                 ran out; a work dir that was removed, or replaced by another.
             CheckpointError, ConfigError, DataError: the inputs do not fit.
         """
-        from fluxvla_core.training import distributed, memory
-        from fluxvla_core.training.progress import Progress
+        from fluxvla_core.training.failures import explain
+        from fluxvla_core.training.state import Progress
         from fluxvla_core.training.stop import StopRequest, stopped
         from fluxvla_core.training.trainer import Trainer
 
@@ -118,8 +118,7 @@ class BaseTrainRunner(Strategy):
             self.check_work_dir()
             if isinstance(error, RunFailed):
                 raise
-            step = self.progress.step + 1
-            known = memory.explain(error, step) or distributed.explain(error, self.world, step)
+            known = explain(error, self.progress.step + 1, self.world)
             if known is None:
                 raise
             raise known from error
@@ -161,9 +160,10 @@ class BaseTrainRunner(Strategy):
     def _build_vla(self) -> nn.Module:
         """The config's ``model``, from equal weights on every rank, as the settings have it."""
         from fluxvla_core.contracts.training import VLA
-        from fluxvla_core.training import flops, lora
+        from fluxvla_core.training import lora
+        from fluxvla_core.training.cost import Meter
         from fluxvla_core.training.model import checkpoint_activations, compile_units
-        from fluxvla_core.training.rng import seed_all
+        from fluxvla_core.training.state import seed_all
         from fluxvla_core.training.weights import base_to_note, put_parts, start_training_from
 
         # For a ``run_setup`` that calls this method alone.
@@ -188,7 +188,7 @@ class BaseTrainRunner(Strategy):
         if self.lora is not None:
             self.adapter_base = base_to_note(before, init_from)
             lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
-        self.flops = flops.Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
+        self.flops = Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:
             checkpoint_activations(vla)
         if options.compile_blocks:
@@ -197,8 +197,7 @@ class BaseTrainRunner(Strategy):
 
     def _build_lr_scheduler(self, n_train_examples: int) -> Any:
         """The schedule over all steps of the run; has ``step`` and a JSON ``state_dict``."""
-        from fluxvla_core.training.lr_scheduler import ScheduledLR
-        from fluxvla_core.training.schedule import make_schedule
+        from fluxvla_core.training.optimizers import ScheduledLR, make_schedule
 
         options = self.options
         schedule = make_schedule(
@@ -240,17 +239,36 @@ class BaseTrainRunner(Strategy):
     def _join(self) -> None:
         """Join the other ranks, lock the work dir, choose a checkpoint to resume from; once."""
         from fluxvla_core.training import distributed
-        from fluxvla_core.training.resuming import choose_checkpoint, lock_on_first
+        from fluxvla_core.training.resuming import choose_checkpoint
 
         if self._world is not None:
             return
         self._world = distributed.start(self.options.device, self.needs_process_group)
-        self._work_dir_lock = lock_on_first(self._world, self.context)
+        distributed.run_on_rank0(self._world, self._own_work_dir)
         configured = self.options.resume_from
         wanted = self.context.resume or configured
         self.resume_checkpoint = choose_checkpoint(
             self._world, self.context, wanted, first=configured
         )
+
+    def _own_work_dir(self) -> str:
+        """Make the work dir's folder of checkpoints, and keep other trainings out; on rank 0 only.
+
+        Raises:
+            UsageError: it cannot be written, or another training is using it.
+        """
+        from fluxvla_core.atomic import prepare_folder
+        from fluxvla_core.checkpoints.lock import lock_work_dir
+        from fluxvla_core.checkpoints.manifest import FOLDER
+
+        work_dir = self.context.work_dir
+        what, advice = (
+            "folder of the checkpoints",
+            "name a folder that can be written: --work-dir DIR",
+        )
+        prepare_folder(work_dir / FOLDER, what, next=advice)
+        self._work_dir_lock = lock_work_dir(work_dir, self.context.reporter.warn)
+        return ""
 
     def check_work_dir(self) -> None:
         """See that the work dir is still this run's; the first rank has the lock.

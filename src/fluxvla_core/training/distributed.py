@@ -22,30 +22,7 @@ from torch.distributed import PrefixStore  # type: ignore[attr-defined]
 from torch.distributed.rendezvous import rendezvous
 
 from fluxvla_core import errors
-from fluxvla_core.errors import ConfigError, FluxError, RunFailed
-
-# As gloo, c10d's store and NCCL's process group word it; the system's own words come through them.
-_LOST = (
-    "connection closed by peer",
-    "connection was likely closed",
-    "connection reset by peer",
-    "connection refused",
-    "connection timed out",
-    "broken pipe",
-    "socket closed",
-    "socket unexpectedly closed",
-    "socket timeout",
-    "client socket has timed out",
-    "client socket has failed to connect",
-    "timed out waiting",
-    "operation timed out",
-    "seconds waiting for clients",
-    "wait timeout after",
-    "application timeout caused pair closure",
-    "collective operation timeout",
-    "nccl communicator was aborted",
-    "nccl error",
-)
+from fluxvla_core.errors import ConfigError, FluxError
 
 
 @dataclass(frozen=True)
@@ -264,20 +241,3 @@ def broadcast_buffers(world: World, model: nn.Module) -> None:
         dist.broadcast(sent, 0)
         if sent is not buffer:
             buffer.copy_(sent)
-
-
-def explain(error: Exception, world: World, step: int) -> RunFailed | None:
-    """Explain a broken collective operation; None if ``error`` is about something else."""
-    text = str(error).strip().lower()
-    # A loader worker's error comes with its traceback; an OSError is of this machine's own.
-    elsewhere = text.startswith("caught ") or isinstance(error, OSError)
-    if world.size == 1 or elsewhere or not any(sign in text for sign in _LOST):
-        return None
-    return RunFailed(
-        f"rank {world.rank} of {world.size} lost another rank during step {step}",
-        cause="another process of this run ended; its own message says why ("
-        + str(error).strip().splitlines()[0][:200]
-        + ")",
-        next="fix what that message names, then run the same command with --resume auto",
-        reason="rank lost",
-    )

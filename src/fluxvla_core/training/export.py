@@ -26,6 +26,7 @@ from fluxvla_core.atomic import prepare_folder, refuse_content
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints import checkpoint as ckpt
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.checkpoints.foreign import formats, read_foreign, unknown_format
 from fluxvla_core.checkpoints.shards import Stored
 from fluxvla_core.checkpoints.tensors import TensorFile, check_names
 from fluxvla_core.checkpoints.writer import PARTIAL, CheckpointWriter
@@ -34,15 +35,14 @@ from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA, Transform
-from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
+from fluxvla_core.data.inference_dataset import PrivateInferenceDataset, try_preparation
 from fluxvla_core.data.lerobot import EMBODIMENT as DATASET_EMBODIMENT
 from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
-from fluxvla_core.data.preparation import check_statistics, try_preparation
+from fluxvla_core.data.statistics import check_statistics
 from fluxvla_core.data.transforms.pipeline import Pipeline, redirected
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, UsageError, located
 from fluxvla_core.spec.embodiment import EmbodimentSpec
-from fluxvla_core.training.formats import formats, read_foreign, unknown_format
 from fluxvla_core.training.lora import CONFIG as ADAPTER
 from fluxvla_core.training.weights import (
     LeftOut,

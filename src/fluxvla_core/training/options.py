@@ -10,7 +10,7 @@ from fluxvla_core.build import RunContext
 from fluxvla_core.config.resolve import LOADER_KEYS
 from fluxvla_core.errors import ConfigError, Problem, nearest
 from fluxvla_core.training.lora import LoraOptions, check_installed
-from fluxvla_core.training.schedule import make_schedule
+from fluxvla_core.training.optimizers import make_schedule
 
 DTYPES = ("bf16",)
 SAVE_STEPS = 10_000

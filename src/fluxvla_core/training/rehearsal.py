@@ -26,7 +26,7 @@ from fluxvla_core.errors import ConfigError, FluxError
 from fluxvla_core.spec.embodiment import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
-from fluxvla_core.training.footprint import (
+from fluxvla_core.training.cost import (
     NOTHING,
     Footprint,
     Kept,
@@ -35,8 +35,7 @@ from fluxvla_core.training.footprint import (
     kept_by_fake,
     optimizer_bytes,
 )
-from fluxvla_core.training.model import ForwardArguments, check_observations
-from fluxvla_core.training.parameters import Layout, trainable
+from fluxvla_core.training.model import ForwardArguments, Layout, check_observations, trainable
 from fluxvla_core.training.strategy import Strategy
 
 PROCESSES = (1, 2, 4, 8)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints import checkpoint as ckpt
-from fluxvla_core.checkpoints.retention import rotate
+from fluxvla_core.checkpoints.checkpoint import rotate
 from fluxvla_core.checkpoints.shards import is_sharded, local_shards
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
@@ -27,8 +27,7 @@ from fluxvla_core.config.snapshot import environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, all_gather_text, all_reduce_max, run_on_rank0
-from fluxvla_core.training.ema import Ema
-from fluxvla_core.training.rng import rng_state
+from fluxvla_core.training.state import Ema, rng_state
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
@@ -101,11 +100,12 @@ def save_snapshot(
     if sharded:
         shards = local_shards(tensors, world.is_rank0)
         if shards:
-            files.append(TensorFile.shards(shard_file(world.rank), shards))
+            name = f"{ckpt.OPTIMIZER_SHARDS}/rank-{world.rank:05d}.safetensors"
+            files.append(TensorFile.shards(name, shards))
     else:
         files.append(TensorFile.full(ckpt.OPTIMIZER, tensors, world.is_rank0))
 
-    def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> Path:
+    def write(group: World, held: Iterable[TensorFile], warn: Callable[[str], None]) -> None:
         try:
             for file in held:
                 file.write(writer)
@@ -119,16 +119,16 @@ def save_snapshot(
                 writer.write_bytes(name, data)
             for name in snapshot.folders:
                 writer.add_folder(name)
-            path = writer.commit()
+            writer.commit()
             try:
                 rotate(work_dir, keep, spare=spare)
             except OSError as error:
                 warn(f"old checkpoints could not be removed: {error}")
-            return str(path)
+            return ""
 
-        return Path(run_on_rank0(group, finish))
+        run_on_rank0(group, finish)
 
-    saver.start(step, files, write)
+    saver.start(Save(step, writer.final), files, write)
     return writer.final
 
 
@@ -150,11 +150,6 @@ def _model_files(saver: Saver, snapshot: Snapshot) -> list[TensorFile]:
 def rng_file(rank: int) -> str:
     """Name of a rank's file of random states."""
     return f"{ckpt.RANDOM}/rank-{rank:05d}.safetensors"
-
-
-def shard_file(rank: int) -> str:
-    """Name of a rank's file with its shards of the optimizer's state."""
-    return f"{ckpt.OPTIMIZER_SHARDS}/rank-{rank:05d}.safetensors"
 
 
 def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[str, dict[str, Any]]:
@@ -206,24 +201,18 @@ def run_folders(dataset: Any, tokenizer: Any) -> dict[str, Callable[[Path], Any]
 
 
 @dataclass
-class _Job:
-    """A checkpoint being written; ``copied`` is set once the training may change its tensors."""
+class Save:
+    """A checkpoint being written; once it is complete, ``path`` is its folder.
 
-    step: int
-    copied: threading.Event = field(default_factory=threading.Event)
-    warnings: list[str] = field(default_factory=list)
-    path: Path | None = None
-    error: BaseException | None = None
-    thread: threading.Thread | None = None
-
-
-@dataclass(frozen=True)
-class Saved:
-    """A checkpoint that has its name."""
+    ``copied`` is set as soon as the training may change its tensors.
+    """
 
     step: int
     path: Path
-    warnings: tuple[str, ...]
+    copied: threading.Event = field(default_factory=threading.Event)
+    warnings: list[str] = field(default_factory=list)
+    error: BaseException | None = None
+    thread: threading.Thread | None = None
 
 
 class Saver:
@@ -242,38 +231,38 @@ class Saver:
         if background and world.size > 1:
             # The threads of all ranks talk while the training talks on the other groups.
             self._threads = replace(world, control=dist.new_group(backend="gloo"))
-        self._job: _Job | None = None
+        self._save: Save | None = None
         self._memory: dict[tuple[str, int], Tensor] = {}
         self._before_step = getattr(optimizer, "register_step_pre_hook", None)
         self._hook: Any = None
 
     def start(
         self,
-        step: int,
+        save: Save,
         files: Sequence[TensorFile],
-        write: Callable[[World, Iterable[TensorFile], Callable[[str], None]], Path],
+        write: Callable[[World, Iterable[TensorFile], Callable[[str], None]], None],
     ) -> None:
-        """Let ``write(world, files, warn)`` make the checkpoint of ``step``; all ranks call it.
+        """Let ``write(world, files, warn)`` make the checkpoint; all ranks call it.
 
         The one before must have been finished with :meth:`finish_pending`.
         """
-        job = self._job = _Job(step)
-        warn = job.warnings.append
+        self._save = save
+        warn = save.warnings.append
         if not self.background:
-            self._run(job, lambda: write(self.world, files, warn))
+            self._run(save, lambda: write(self.world, files, warn))
             return
         gathered = [file.gathered(partial(self._host_copy, file.name)) for file in files]
         stream = _copy_stream(self.world.device)
-        job.thread = threading.Thread(
+        save.thread = threading.Thread(
             target=self._run,
             args=(
-                job,
-                lambda: write(self._threads, self._host_copies(job, gathered, stream), warn),
+                save,
+                lambda: write(self._threads, self._host_copies(save, gathered, stream), warn),
             ),
-            name=f"checkpoint-{step}",
+            name=f"checkpoint-{save.step}",
             daemon=True,
         )
-        job.thread.start()
+        save.thread.start()
         if self._before_step is None:
             self.wait_for_copies()
         else:
@@ -282,10 +271,10 @@ class Saver:
 
     def wait_for_copies(self) -> None:
         """Wait until weights and optimizer may change. The optimizer's step does so by itself."""
-        if self._job is not None and self._job.thread is not None:
-            self._job.copied.wait()
+        if self._save is not None and self._save.thread is not None:
+            self._save.copied.wait()
 
-    def finish_pending(self, wait: bool) -> Saved | None:
+    def finish_pending(self, wait: bool) -> Save | None:
         """Finish the pending save, if there is one; all ranks call it at the same step.
 
         Args:
@@ -294,60 +283,51 @@ class Saver:
         Raises:
             RunFailed: it could not be saved.
         """
-        job = self._job
-        if job is None:
+        save = self._save
+        if save is None:
             return None
-        if job.thread is not None:
-            if not wait and all_reduce_max(self.world, int(job.thread.is_alive())):
+        if save.thread is not None:
+            if not wait and all_reduce_max(self.world, int(save.thread.is_alive())):
                 return None
-            job.thread.join()
+            save.thread.join()
         if self._hook is not None:
             self._hook.remove()
-        self._job = self._hook = None
-        if job.error is not None:
-            raise job.error
-        assert job.path is not None
-        return Saved(job.step, job.path, tuple(job.warnings))
+        self._save = self._hook = None
+        if save.error is not None:
+            raise save.error
+        return save
 
     def close(self) -> None:
         """Wait for the pending save, whether it succeeds or not."""
-        if self._job is not None and self._job.thread is not None:
-            self._job.thread.join()
+        if self._save is not None and self._save.thread is not None:
+            self._save.thread.join()
 
-    def _run(self, job: _Job, work: Callable[[], Path]) -> None:
+    def _run(self, save: Save, work: Callable[[], None]) -> None:
         try:
-            job.path = work()
+            work()
         except BaseException as error:  # noqa: BLE001 - finish_pending raises it
-            job.error = error
+            save.error = error
 
     def _host_copies(
-        self, job: _Job, files: Sequence[TensorFile], stream: AbstractContextManager[object]
+        self, save: Save, files: Sequence[TensorFile], stream: AbstractContextManager[object]
     ) -> Iterator[TensorFile]:
         """Copies of ``files``; all are made before the first is written."""
         try:
             with stream:
-                held = [
-                    replace(
-                        file,
-                        tensors=tuple(
-                            self._host_copy(file.name, i, t) for i, t in enumerate(file.tensors)
-                        ),
-                    )
-                    for file in files
-                ]
+                held = []
+                for file in files:
+                    copies = (self._host_copy(file.name, i, t) for i, t in enumerate(file.tensors))
+                    held.append(replace(file, tensors=tuple(copies)))
         finally:
-            job.copied.set()
+            save.copied.set()
         yield from held
 
     def _host_copy(self, file: str, index: int, tensor: Tensor) -> Tensor:
-        return self._copy((file, index), tensor)
-
-    def _copy(self, place: tuple[str, int], tensor: Tensor) -> Tensor:
         """``tensor`` in a host buffer that is reused by every save, pinned if it is on a GPU."""
-        buffer = self._memory.get(place)
+        buffer = self._memory.get((file, index))
         if buffer is None or buffer.shape != tensor.shape or buffer.dtype != tensor.dtype:
             buffer = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
-            self._memory[place] = buffer
+            self._memory[file, index] = buffer
         if buffer is tensor:
             return buffer
         with torch.no_grad():

@@ -22,38 +22,31 @@ from fluxvla_core.training.distributed import World, all_gather_text, all_reduce
 
 
 @dataclass(frozen=True)
-class StepRecord:
-    """One step over all ranks: mean loss, gradient norm (None if unknown), and times.
+class Step:
+    """The numbers of one step on this rank; losses and ids are those of its micro-batches.
 
-    ``by_dataset`` is the mean loss of the samples of each dataset that the step used.
-
-    ``data_wait`` (the host's) and ``step_time`` are seconds, means over the ranks, and off the CPU
-    over the steps fetched together; ``lr`` is the rate used.
+    Args:
+        epoch: epochs done before it, with fraction.
+        lr: the learning rate used.
+        losses: scalars, still on the device.
+        ids: sample ids ``(B,)``, a list of them, or None.
+        norm: of the gradients, over all ranks; None if unknown.
+        samples: used by all ranks together.
+        wait: seconds that the host waited for data.
+        sample_losses: ``(B,)`` of the samples, where the model returns them.
+        ended: the host's clock when it was launched.
     """
 
     step: int
     epoch: float
-    loss: float
-    grad_norm: float | None
     lr: float
-    step_time: float
-    data_wait: float
-    samples_per_s: float
-    by_dataset: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass
-class _Pending:
-    step: int
-    epoch: float
-    lr: float
-    losses: list[Tensor]
-    ids: list[Any]
-    each: list[Tensor | None]
+    losses: Sequence[Tensor]
+    ids: Sequence[Any]
     norm: Tensor | None
     samples: int
     wait: float
-    ended: float
+    sample_losses: Sequence[Tensor | None] = ()
+    ended: float = field(default_factory=lambda: time.perf_counter())
 
 
 @dataclass
@@ -66,36 +59,23 @@ class StepMetrics:
     world: World
     parts: Mapping[str, int] = field(default_factory=dict)
     began: float = field(default_factory=time.perf_counter)
-    _pending: list[_Pending] = field(default_factory=list)
+    _pending: list[Step] = field(default_factory=list)
 
     def restart_clock(self) -> None:
         """Leave what happened since the last step (a save) out of the next step's time."""
         self.began = time.perf_counter()
 
-    def add(
-        self,
-        step: int,
-        epoch: float,
-        lr: float,
-        losses: list[Tensor],
-        ids: list[Any],
-        norm: Tensor | None,
-        samples: int,
-        wait: float,
-        each: Sequence[Tensor | None] = (),
-    ) -> None:
-        """Keep one step: a loss and the sample ids of each micro-batch, all still on the device.
+    def add(self, step: Step) -> None:
+        """Keep one step; nothing is fetched from the device."""
+        self._pending.append(step)
 
-        ``each`` are the losses ``(B,)`` of a micro-batch's samples, where the model returns them.
-        ``samples`` is over all ranks; ``wait`` the seconds spent waiting for data.
-        """
-        now = time.perf_counter()
-        self._pending.append(
-            _Pending(step, epoch, lr, losses, ids, list(each), norm, samples, wait, now)
-        )
+    def fetch(self) -> list[dict[str, Any]]:
+        """A record of each step since the last fetch, over all ranks; waits for the device.
 
-    def fetch(self) -> list[StepRecord]:
-        """Everything since the last fetch, averaged over ranks; the host waits for the device.
+        Records are what a metric's ``commit`` is given: ``loss`` is the mean over the ranks,
+        ``grad_norm`` None if unknown, ``step_time`` in seconds, ``data_wait`` its share that the
+        host waited for data, ``loss/<name>`` the mean of a dataset's samples. Off the CPU times are
+        means over the steps fetched together.
 
         Raises:
             RunFailed: a loss or gradient norm is not finite; names step, rank and samples.
@@ -115,25 +95,24 @@ class StepMetrics:
         mean /= self.world.size
         if not bool(torch.isfinite(mean[:2]).all()):
             raise self._not_finite(steps, mean)
-        shares = self._by_dataset(steps)
         return [
-            StepRecord(
-                step=s.step,
-                epoch=s.epoch,
-                loss=loss,
-                grad_norm=None if s.norm is None else norm,
-                lr=s.lr,
-                step_time=seconds,
-                data_wait=wait,
-                samples_per_s=s.samples / seconds if seconds > 0 else 0.0,
-                by_dataset=share,
-            )
-            for s, share, loss, norm, seconds, wait in zip(
-                steps, shares, *mean.tolist(), strict=True
+            {
+                "global_step": s.step,
+                "epoch": s.epoch,
+                "loss": loss,
+                "grad_norm": None if s.norm is None else norm,
+                "lr": s.lr,
+                "step_time": seconds,
+                "samples_per_s": s.samples / seconds if seconds > 0 else 0.0,
+                "data_wait": wait / seconds if seconds > 0 else 0.0,
+                **{f"loss/{name}": mean for name, mean in by_dataset.items()},
+            }
+            for s, by_dataset, loss, norm, seconds, wait in zip(
+                steps, self._by_dataset(steps), *mean.tolist(), strict=True
             )
         ]
 
-    def _clocked(self, steps: list[_Pending], now: float) -> tuple[list[float], list[float]]:
+    def _clocked(self, steps: list[Step], now: float) -> tuple[list[float], list[float]]:
         """Step times and data waits of ``steps``; the times add up to what went by until now."""
         ends = [self.began, *(s.ended for s in steps[:-1]), now]
         self.began = now
@@ -144,14 +123,14 @@ class StepMetrics:
         # The host runs ahead: its times are of launching steps, and only their sum is true.
         return [fmean(times)] * len(steps), [fmean(waits)] * len(steps)
 
-    def _by_dataset(self, steps: list[_Pending]) -> list[dict[str, float]]:
+    def _by_dataset(self, steps: list[Step]) -> list[dict[str, float]]:
         if len(self.parts) < 2:
             return [{} for _ in steps]
         # Sums and counts of every step and dataset: ranks without the one add zeros.
         sums = torch.zeros(2, len(steps), len(self.parts), dtype=torch.float64)
         ends = torch.tensor(list(self.parts.values())).cumsum(0)
         for row, step in enumerate(steps):
-            for losses, ids in zip(step.each, step.ids, strict=False):
+            for losses, ids in zip(step.sample_losses, step.ids, strict=False):
                 if losses is None or not isinstance(ids, Tensor):
                     continue
                 part = torch.bucketize(ids.cpu(), ends, right=True).clamp(max=len(ends) - 1)
@@ -164,7 +143,7 @@ class StepMetrics:
             for row, count in zip(means.tolist(), counts.tolist(), strict=True)
         ]
 
-    def _not_finite(self, steps: list[_Pending], mean: Tensor) -> RunFailed:
+    def _not_finite(self, steps: list[Step], mean: Tensor) -> RunFailed:
         bad = int((~torch.isfinite(mean[:2])).any(dim=0).nonzero()[0])
         step, loss, norm = steps[bad], mean[0, bad].item(), mean[1, bad].item()
         if math.isfinite(loss):
@@ -194,19 +173,3 @@ def _which(ids: Any) -> str:
     if ids is None:
         return "a batch without sample_ids"
     return f"samples {ids.tolist() if isinstance(ids, Tensor) else ids}"
-
-
-def as_metrics(record: StepRecord) -> dict[str, Any]:
-    """The fields that a metric is given for one step."""
-    seconds = record.step_time
-    return {
-        "global_step": record.step,
-        "epoch": record.epoch,
-        "loss": record.loss,
-        "grad_norm": record.grad_norm,
-        "lr": record.lr,
-        "step_time": seconds,
-        "samples_per_s": record.samples_per_s,
-        "data_wait": record.data_wait / seconds if seconds > 0 else 0.0,
-        **{f"loss/{name}": loss for name, loss in record.by_dataset.items()},
-    }

@@ -27,15 +27,12 @@ if TYPE_CHECKING:
     from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.checkpoints.lock import WorkDirLock
     from fluxvla_core.checkpoints.shards import Stored
-    from fluxvla_core.data.sampler import EpisodeShards
-    from fluxvla_core.training.batches import StepPlan
+    from fluxvla_core.data.sampler import EpisodeShards, StepPlan
+    from fluxvla_core.training.cost import Meter
     from fluxvla_core.training.distributed import World
-    from fluxvla_core.training.ema import Ema
-    from fluxvla_core.training.flops import Meter
-    from fluxvla_core.training.model import ForwardArguments
-    from fluxvla_core.training.parameters import Layout
-    from fluxvla_core.training.progress import Progress
+    from fluxvla_core.training.model import ForwardArguments, Layout
     from fluxvla_core.training.saving import Saver, Snapshot
+    from fluxvla_core.training.state import Ema, Progress
     from fluxvla_core.training.weights import LeftOut
 
 _NO_CONTEXT = nullcontext()
@@ -111,7 +108,7 @@ class Strategy(TrainRunner):
             processes: that train, all on one machine.
             device_type: ``cuda`` or ``cpu``.
         """
-        from fluxvla_core.training.parameters import replicated_layout
+        from fluxvla_core.training.model import replicated_layout
 
         return replicated_layout(model)
 
@@ -123,7 +120,7 @@ class Strategy(TrainRunner):
 
     def _build_optimizer(self) -> torch.optim.Optimizer:
         """The config's ``optimizer``, with weight decay on matrices only."""
-        from fluxvla_core.training.parameters import decay_groups
+        from fluxvla_core.training.model import decay_groups
 
         groups = decay_groups(self.model, self.weight_decay)
         built: torch.optim.Optimizer = self.optimizer_settings.build(groups, self.learning_rate)
@@ -156,7 +153,7 @@ class Strategy(TrainRunner):
         Where ``clip_grad_norm`` returns None it is computed here: gradients that are not finite
         must not go unseen.
         """
-        from fluxvla_core.training.parameters import gradient_norm
+        from fluxvla_core.training.model import gradient_norm
 
         norm = self.clip_grad_norm()
         if norm is None:
@@ -179,7 +176,7 @@ class Strategy(TrainRunner):
 
         None says nothing of the norm, as where there is no ``max_grad_norm``.
         """
-        from fluxvla_core.training.parameters import clip_
+        from fluxvla_core.training.model import clip_
 
         return None if self.max_grad_norm is None else clip_(self._optimized(), self.max_grad_norm)
 
@@ -239,7 +236,7 @@ class Strategy(TrainRunner):
         saved = self.saver.finish_pending(wait) if self.saver is not None else None
         if saved is None or not self.world.is_rank0:
             return
-        from fluxvla_core.checkpoints.retention import name_best
+        from fluxvla_core.checkpoints.checkpoint import name_best
 
         for warning in saved.warnings:
             self.context.reporter.warn(warning)
@@ -251,8 +248,8 @@ class Strategy(TrainRunner):
     def _snapshot(self, train_loss: float | None, only_trainable: bool) -> Snapshot:
         """The present moment, without frozen weights that the model brings itself if so asked."""
         from fluxvla_core.training import lora
-        from fluxvla_core.training.rng import seeds_of
         from fluxvla_core.training.saving import Snapshot, run_documents, run_folders
+        from fluxvla_core.training.state import seeds_of
         from fluxvla_core.training.weights import LeftOut
 
         brings = self.left_out if only_trainable and self.left_out is not None else LeftOut()
@@ -293,15 +290,14 @@ class Strategy(TrainRunner):
                 the two keeps averages.
         """
         from fluxvla_core.checkpoints import checkpoint as ckpt
-        from fluxvla_core.training import resume_checks, resuming
-        from fluxvla_core.training.optimizer_state import SavedOptimizer
-        from fluxvla_core.training.progress import Progress
+        from fluxvla_core.training import resuming
+        from fluxvla_core.training.state import Progress, SavedOptimizer
 
         checkpoint = self.resume_checkpoint
         if checkpoint is None:
             return 0
         where = str(checkpoint.path)
-        saved, notes = resume_checks.check_settings(
+        saved, notes = resuming.check_settings(
             checkpoint, self.context, self.plan, self.dataset, self.lora, self.options.ema_decay
         )
         for note in notes if self.world.is_rank0 else ():
@@ -328,7 +324,7 @@ class Strategy(TrainRunner):
         The rate follows the part of the run that is done. A count of the old steps would be past
         the end of fewer, larger ones, and train the rest at a rate of 0.
         """
-        from fluxvla_core.training.lr_scheduler import ScheduledLR
+        from fluxvla_core.training.optimizers import ScheduledLR
 
         same = saved["step_samples"] == self.plan.step_samples
         if same or not isinstance(self.lr_scheduler, ScheduledLR):
@@ -355,7 +351,7 @@ class Strategy(TrainRunner):
 
     def optimizer_tensors(self) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
         """The optimizer's state by ``<parameter>/<key>``, and JSON values of the rest of it."""
-        from fluxvla_core.training.optimizer_state import named_state
+        from fluxvla_core.training.state import named_state
 
         return named_state(self.model, self.optimizer)
 
@@ -363,7 +359,7 @@ class Strategy(TrainRunner):
         self, tensors: Mapping[str, Tensor | Stored], described: Mapping[str, Any], where: str
     ) -> bool:
         """The inverse of :meth:`optimizer_tensors`, with :meth:`_load_optimizer_state`."""
-        from fluxvla_core.training.optimizer_state import torch_state
+        from fluxvla_core.training.state import torch_state
 
         state = torch_state(self.model, self.optimizer, tensors, described, where)
         return self._load_optimizer_state(state)
@@ -399,7 +395,7 @@ class Strategy(TrainRunner):
 
     def plan_steps(self, samples: int, shards: EpisodeShards | None = None) -> StepPlan:
         """The plan that cuts epochs of so many samples into steps."""
-        from fluxvla_core.training.batches import StepPlan
+        from fluxvla_core.data.sampler import StepPlan
 
         return StepPlan(
             samples,

@@ -8,23 +8,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from itertools import chain
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import torch.distributed as dist
 
-from fluxvla_core.checkpoints.retention import name_best
+from fluxvla_core.checkpoints.checkpoint import name_best
 from fluxvla_core.contracts.training import Dataset
-from fluxvla_core.data.loader import make_loader
+from fluxvla_core.data.loader import IDS, loader_source, make_loader, to_device
+from fluxvla_core.data.sampler import StepSampler, episode_shards
 from fluxvla_core.hooks import HookCaller
-from fluxvla_core.training import memory
-from fluxvla_core.training.batches import IDS, StepSampler, episode_shards, loader_source, to_device
-from fluxvla_core.training.ema import Ema
-from fluxvla_core.training.model import ForwardArguments, check_observations
-from fluxvla_core.training.parameters import trainable
+from fluxvla_core.training.cost import GB, peak_bytes
+from fluxvla_core.training.model import ForwardArguments, check_observations, trainable
 from fluxvla_core.training.resuming import forget_missing, restore_rng
-from fluxvla_core.training.rng import take_seed
 from fluxvla_core.training.saving import Saver
-from fluxvla_core.training.step_metrics import StepMetrics, as_metrics
+from fluxvla_core.training.state import Ema
+from fluxvla_core.training.step_metrics import Step, StepMetrics
 from fluxvla_core.training.stop import StopRequest
 from fluxvla_core.training.validation import NotFinite, Validation, validation_dataset
 from fluxvla_core.training.weights import left_out
@@ -64,8 +63,9 @@ class Trainer:
         if not world.is_rank0:
             runner.hooks = HookCaller(context)
         runner.dataset = dataset
-        take_seed(dataset, options.seed)
-        warnings = Dataset.adapt(dataset).warnings()
+        described = Dataset.adapt(dataset)
+        described.use_seed(options.seed)
+        warnings = described.warnings()
         for warning in warnings if world.is_rank0 else ():
             context.reporter.warn(warning)
         where = context.where("train_dataloader.shuffle_episodes")
@@ -74,7 +74,7 @@ class Trainer:
         runner.saver = Saver(world, options.async_save, runner.optimizer)
         where = context.where(f"{context.section}.collator")
         runner.forward_arguments = ForwardArguments(runner.model, where)
-        check_observations(runner.model, dataset, context, "train_dataloader")
+        check_observations(runner.model, dataset, context)
         if runner.left_out is None:
             runner.left_out = left_out(runner.model)
         if options.ema_decay is not None:
@@ -95,12 +95,7 @@ class Trainer:
         held_out = validation_dataset(runner.context, dataset, seed)
         check_observations(runner.model, held_out, runner.context, "val_dataloader")
         return Validation(
-            held_out,
-            runner.collator,
-            runner.val_options,
-            runner.world,
-            seed,
-            self._stop,
+            held_out, runner.collator, runner.val_options, runner.world, seed, self._stop
         )
 
     def _start_metrics(self, dataset: Any) -> None:
@@ -115,11 +110,10 @@ class Trainer:
         """Start the loader at the run's position in the data, and its workers."""
         runner = self._runner
         world = runner.world
-        sampler: Any = StepSampler(runner.plan, world.rank, runner.progress.cursor)
         loader = make_loader(
             loader_source(dataset, runner.collator, world.device),
             runner.collator,
-            sampler,
+            StepSampler(runner.plan, world.rank, runner.progress.cursor),
             runner.loader_options.per_device_num_workers,
             pin_memory=world.device.type == "cuda",
             reporter=runner.context.reporter if world.is_rank0 else None,
@@ -188,21 +182,20 @@ class Trainer:
         plan, progress = runner.plan, runner.progress
         epoch = progress.cursor.epoch + progress.cursor.samples / plan.length
         progress.step, progress.cursor = step, plan.after_step(progress.cursor)
-        self._window.add(step, epoch, rate, losses, ids, norm, plan.step_samples, waited, each)
+        samples = plan.step_samples
+        self._window.add(Step(step, epoch, rate, losses, ids, norm, samples, waited, each))
 
     def _fetch(self) -> list[dict[str, Any]]:
         """The records of the steps since the last fetch, as a metric is given them."""
         runner = self._runner
-        steps = self._window.fetch()
-        runner.progress.loss = steps[-1].loss
-        self._stop.set_interval(sum(s.step_time for s in steps) / len(steps))
-        records = [as_metrics(step) for step in steps]
+        records = self._window.fetch()
+        runner.progress.loss = records[-1]["loss"]
+        self._stop.set_interval(fmean(record["step_time"] for record in records))
         if runner.flops is not None:
             for record in records:
                 parts = runner.options.grad_accumulation_steps
                 record["mfu"] = runner.flops.mfu(parts, record["step_time"])
-        cuda = runner.world.device.type == "cuda"
-        records[-1]["memory_gb"] = memory.peak_bytes(cuda) / memory.GB
+        records[-1]["memory_gb"] = peak_bytes(runner.world.device.type == "cuda") / GB
         return records
 
     def _report(self, records: list[dict[str, Any]]) -> None:

@@ -12,14 +12,12 @@ from torch import Tensor, nn
 from fluxvla_core.build import RunContext, build_dataset_from_cfg
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import Dataset
-from fluxvla_core.data.loader import make_loader
-from fluxvla_core.data.sampler import EpochSampler
+from fluxvla_core.data.loader import loader_source, make_loader, to_device
+from fluxvla_core.data.sampler import StepPlan, StepSampler
 from fluxvla_core.errors import ConfigError, RunFailed
-from fluxvla_core.training.batches import loader_source, to_device
 from fluxvla_core.training.distributed import World, all_reduce_sum
-from fluxvla_core.training.ema import Ema
 from fluxvla_core.training.options import LoaderOptions
-from fluxvla_core.training.rng import rank_seed, rng_state, seed_all, set_rng_state, take_seed
+from fluxvla_core.training.state import Ema, rank_seed, rng_state, seed_all, set_rng_state
 from fluxvla_core.training.stop import StopRequest
 
 
@@ -53,14 +51,9 @@ class Validation:
         stop: StopRequest,
     ) -> None:
         self._world, self._seed, self._stop = world, seed, stop
-        sampler = EpochSampler(
-            len(dataset),
-            options.per_device_batch_size,
-            rank=world.rank,
-            world=world.size,
-            shuffle=False,
-        )
-        batches: Any = list(sampler.batches(0))
+        size = options.per_device_batch_size
+        plan = StepPlan(len(dataset), size, world=world.size, shuffle=False)
+        batches = list(StepSampler(plan, world.rank).epoch(0))
         self._loader = make_loader(
             loader_source(dataset, collator, world.device),
             collator,
@@ -139,7 +132,7 @@ def validation_dataset(context: RunContext, train: Any, seed: int) -> Any:
     """The dataset of ``val_dataloader``, normalised by the statistics of the dataset ``train``."""
     dataset = build_dataset_from_cfg(context.config["val_dataloader"]["dataset"], context)
     share_statistics(train, dataset)
-    take_seed(dataset, seed)
+    Dataset.adapt(dataset).use_seed(seed)
     return dataset
 
 

@@ -18,7 +18,15 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
-from fluxvla_core.checkpoints.foreign import HUB, foreign_folder, safetensors_in, torch_table
+from fluxvla_core.checkpoints.foreign import (
+    HUB,
+    foreign_folder,
+    is_foreign,
+    read_foreign,
+    safetensors_in,
+    telling_families,
+    torch_table,
+)
 from fluxvla_core.checkpoints.shards import Stored, StoredTensors
 from fluxvla_core.checkpoints.tensors import check_names, read_tensors, shard_like
 from fluxvla_core.contracts.training import PartWeights
@@ -26,7 +34,6 @@ from fluxvla_core.data.transforms.pipeline import redirected
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, run_on_rank0
-from fluxvla_core.training.formats import is_foreign, read_foreign, telling_families
 from fluxvla_core.training.model import frozen_sources, set_frozen_source
 
 

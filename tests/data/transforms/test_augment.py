@@ -6,7 +6,7 @@ import pytest
 from fluxvla_core import build_transform_from_cfg
 from fluxvla_core.data.sampler import sample_rng
 from fluxvla_core.data.transforms.images import RandomShiftImages
-from fluxvla_core.data.transforms.state_action import SampleFlowNoise, StateNoise
+from fluxvla_core.data.transforms.noise import SampleFlowNoise, StateNoise
 from fluxvla_core.errors import ConfigError
 
 

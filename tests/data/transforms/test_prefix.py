@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.build import build_transform_from_cfg
-from fluxvla_core.data.transforms.prefix import SamplePrefixLength
+from fluxvla_core.data.transforms.noise import SamplePrefixLength
 from fluxvla_core.errors import ConfigError
 
 

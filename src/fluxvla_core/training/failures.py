@@ -1,14 +1,19 @@
-"""Peak memory, and messages for errors of a GPU, a host or data workers out of memory."""
+"""Explain errors that end a training: a GPU, a host or a data worker out of memory, a lost rank.
+
+They are torch's, and known by their text; nothing here needs torch itself.
+"""
 
 from __future__ import annotations
 
 import errno
 import re
-import sys
+from typing import TYPE_CHECKING
 
 from fluxvla_core.errors import RunFailed
 
-GB = 1e9
+if TYPE_CHECKING:
+    from fluxvla_core.training.distributed import World
+
 _DEVICE = (
     "cuda error: out of memory",
     "cuda out of memory",
@@ -38,6 +43,35 @@ _SHARED = (
     "unable to write to file </torch",
     "unable to allocate shared memory(shm)",
 )
+# As gloo, c10d's store and NCCL's process group word it; the system's own words come through them.
+_LOST = (
+    "connection closed by peer",
+    "connection was likely closed",
+    "connection reset by peer",
+    "connection refused",
+    "connection timed out",
+    "broken pipe",
+    "socket closed",
+    "socket unexpectedly closed",
+    "socket timeout",
+    "client socket has timed out",
+    "client socket has failed to connect",
+    "timed out waiting",
+    "operation timed out",
+    "seconds waiting for clients",
+    "wait timeout after",
+    "application timeout caused pair closure",
+    "collective operation timeout",
+    "nccl communicator was aborted",
+    "nccl error",
+)
+_LESS_DEVICE = (
+    "lower --set train_dataloader.per_device_batch_size=… and raise --set "
+    "runner.grad_accumulation_steps=… by as much (the result stays the same), or --set "
+    "runner.enable_gradient_checkpointing=true, --set "
+    "runner.enable_mixed_precision_training=true, or split the model: --set "
+    "runner.type=FSDPTrainRunner"
+)
 _LESS_HOST = (
     "lower --set train_dataloader.per_device_num_workers=… or --set "
     "train_dataloader.per_device_batch_size=…, or --set "
@@ -46,11 +80,25 @@ _LESS_HOST = (
 _GO_ON = "then resume with --resume auto: checkpoints are as they were"
 
 
-def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
-    """Explain ``error`` if memory ran out here or in a loader worker; None for other errors."""
+def explain(
+    error: BaseException, step: int | None = None, world: World | None = None
+) -> RunFailed | None:
+    """The error to raise for ``error``; None where nothing here explains it.
+
+    Args:
+        step: in which it happened.
+        world: the processes that trained together.
+    """
+    known = _out_of_memory(error, "" if step is None else f" at step {step}")
+    if known is None and world is not None and world.size > 1:
+        known = _lost_rank(error, step, world)
+    return known
+
+
+def _out_of_memory(error: BaseException, when: str) -> RunFailed | None:
+    """Memory ran out here or in a data worker."""
     text = str(error).strip()
     lower = text.lower()
-    when = "" if step is None else f" at step {step}"
     # torch may say that one is gone from an error that says how.
     origin = f"{lower}\n{error.__cause__ or ''}".lower()
     shared = any(s in origin for s in _SHARED)
@@ -61,21 +109,13 @@ def explain(error: BaseException, step: int | None = None) -> RunFailed | None:
     device = type(error).__name__ == "OutOfMemoryError" or any(s in lower for s in _DEVICE)
     if not (device or _of_host(error, lower)):
         return None
-    what = "the GPU ran" if device else "this machine ran"
-    if device:
-        advice = (
-            "lower --set train_dataloader.per_device_batch_size=… and raise --set "
-            "runner.grad_accumulation_steps=… by as much (the result stays the same), or --set "
-            "runner.enable_gradient_checkpointing=true, --set "
-            "runner.enable_mixed_precision_training=true, or split the model: --set "
-            "runner.type=FSDPTrainRunner"
-        )
-    else:
-        advice = _LESS_HOST
+    lines = text.splitlines()
+    # A worker's error ends with the line that says what there was no room for.
+    found = [line for line in lines if any(s in line.lower() for s in (*_DEVICE, *_HOST))]
     return RunFailed(
-        f"{what} out of memory{when}",
-        cause=_telling_line(text),
-        next=f"{advice}; {_GO_ON}",
+        f"{'the GPU' if device else 'this machine'} ran out of memory{when}",
+        cause=(found[-1:] or lines[:1] or [""])[0].strip()[:300] or None,
+        next=f"{_LESS_DEVICE if device else _LESS_HOST}; {_GO_ON}",
     )
 
 
@@ -84,13 +124,6 @@ def _of_host(error: BaseException, lower: str) -> bool:
     refused = isinstance(error, OSError) and error.errno == errno.ENOMEM
     said = any(s in lower.replace(_NOT_HOST, "") for s in _HOST)
     return refused or said or isinstance(error, MemoryError)
-
-
-def _telling_line(text: str) -> str | None:
-    """The line of an error that says what there was no room for: a worker's ends with it."""
-    lines = text.splitlines()
-    found = [line for line in lines if any(s in line.lower() for s in (*_DEVICE, *_HOST))]
-    return (found[-1:] or lines[:1] or [""])[0].strip()[:300] or None
 
 
 def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFailed:
@@ -119,13 +152,17 @@ def _worker_gone(found: re.Match[str] | None, shared: bool, when: str) -> RunFai
     return RunFailed(what, cause=cause, next=f"{advice}; {_GO_ON}")
 
 
-def peak_bytes(cuda: bool) -> int:
-    """The most that this process has held so far: on its GPU, else in all."""
-    if cuda:
-        import torch
-
-        return int(torch.cuda.max_memory_allocated())
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # getrusage(2): kilobytes on Linux
+def _lost_rank(error: BaseException, step: int | None, world: World) -> RunFailed | None:
+    """A collective operation broke because another process of the run is gone."""
+    text = str(error).strip()
+    # A loader worker's error comes with its traceback; an OSError is of this machine's own.
+    elsewhere = text.lower().startswith("caught ") or isinstance(error, OSError)
+    if elsewhere or not any(sign in text.lower() for sign in _LOST):
+        return None
+    return RunFailed(
+        f"rank {world.rank} of {world.size} lost another rank during step {step}",
+        cause="another process of this run ended; its own message says why ("
+        f"{text.splitlines()[0][:200]})",
+        next="fix what that message names, then run the same command with --resume auto",
+        reason="rank lost",
+    )

@@ -232,7 +232,11 @@ class Numbers:
 
 if __name__ == "__main__":
     loader = make_loader(
-        Numbers(), DictCollator(["x"]), StepSampler(StepPlan(10, 2)), 2, multiprocessing_context=sys.argv[1]
+        Numbers(),
+        DictCollator(["x"]),
+        StepSampler(StepPlan(10, 2)),
+        2,
+        multiprocessing_context=sys.argv[1],
     )
     batches = iter(loader)
     next(batches)

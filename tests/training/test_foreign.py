@@ -12,7 +12,12 @@ from safetensors.torch import load_file, save_file
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
-from fluxvla_core.checkpoints.foreign import check_settings, formats, read_foreign, telling_families
+from fluxvla_core.checkpoints.foreign import (
+    check_settings,
+    explain_other_family,
+    formats,
+    read_foreign,
+)
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, IncompatiblePlugin, SpecMismatch, UsageError
 from fluxvla_core.models import (
@@ -458,13 +463,13 @@ def test_weights_of_another_family_name_both():
 
     with (
         pytest.raises(CheckpointError, match="they differ") as error,
-        telling_families({"type": "fluxvla-reach:ReachVLA"}, OtherVLA()),
+        explain_other_family({"type": "fluxvla-reach:ReachVLA"}, OtherVLA()),
     ):
         raise CheckpointError("they differ", cause="unknown")
     assert error.value.cause == "the checkpoint is of ReachVLA, the config's model is OtherVLA"
     with (
         pytest.raises(CheckpointError) as error,
-        telling_families({"type": "OtherVLA"}, OtherVLA()),
+        explain_other_family({"type": "OtherVLA"}, OtherVLA()),
     ):
         raise CheckpointError("they differ", cause="unknown")
     assert error.value.cause == "unknown"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from fluxvla_fsdp.ties import check_ties
+from fluxvla_fsdp.groups import check_ties
 from torch import nn
 
 from fluxvla_core import VLAS

@@ -140,7 +140,7 @@ def renamed(
         where: the checkpoint, for messages.
 
     Raises:
-        CheckpointError: lists what is missing in the checkpoint, and what it has besides.
+        CheckpointError: lists missing and unexpected names.
     """
     missing = sorted(set(names.values()) - set(tensors))
     extra = sorted(set(tensors) - set(names.values()))
@@ -321,7 +321,7 @@ def formats() -> tuple[list[CheckpointFormat], list[PluginError]]:
 
 
 @contextmanager
-def telling_families(table: Any, model: object) -> Iterator[None]:
+def explain_other_family(table: Any, model: object) -> Iterator[None]:
     """Let errors about weights say that the checkpoint's ``model`` table is of another class than
     ``model``, if it is."""
     try:

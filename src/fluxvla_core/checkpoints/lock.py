@@ -59,7 +59,7 @@ class WorkDirLock:
         A training that continued would fill a place that somebody cleared, or another one's.
 
         Raises:
-            RunFailed: it was removed, moved or replaced; says where what was saved is.
+            RunFailed: it was removed, moved or replaced; and where its checkpoints are now.
         """
         if self._outer is not None:
             self._outer.check()
@@ -143,7 +143,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def _path_of(descriptor: int) -> Path | None:
-    """The current path of an open folder, if the system tells it (Linux); None if removed."""
+    """The current path of an open folder, if the system has it (Linux); None if removed."""
     try:
         found = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
     except OSError:

@@ -100,7 +100,7 @@ def local_shards(tensors: Mapping[str, Tensor], is_rank0: bool) -> dict[str, Ten
     """The local shards of ``tensors`` that this rank saves; each shard is saved by one rank.
 
     Args:
-        is_rank0: whether this rank saves what is not sharded.
+        is_rank0: whether this rank saves the unsharded tensors.
     """
     shards = {}
     for name, tensor in tensors.items():
@@ -252,15 +252,14 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def _shortfall(path: Path) -> str | None:
-    """How many bytes a file has and how many its header tells of; None if they agree, or there is
-    no header."""
+    """How a file's size differs from the one in its header; None if it does not, or without one."""
     try:
         _check_header(path)
         with path.open("rb") as file:
             (length,) = struct.unpack("<Q", file.read(8))
             header = json.loads(file.read(length))
         tensors = (entry for name, entry in header.items() if name != "__metadata__")
-        told = 8 + length + max((entry["data_offsets"][1] for entry in tensors), default=0)
+        stated = 8 + length + max((entry["data_offsets"][1] for entry in tensors), default=0)
         size = path.stat().st_size
     except (
         LookupError,
@@ -272,7 +271,7 @@ def _shortfall(path: Path) -> str | None:
         struct.error,
     ):
         return None  # no header of that format
-    return None if size == told else f"it has {size} bytes instead of {told}"
+    return None if size == stated else f"it has {size} bytes instead of {stated}"
 
 
 def _check_header(path: Path) -> None:

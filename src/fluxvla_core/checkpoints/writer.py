@@ -16,7 +16,6 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, TypeVar
 
 from fluxvla_core.atomic import FULL
@@ -34,18 +33,18 @@ PARTIAL = ".partial"
 class CheckpointWriter:
     """Collects one checkpoint's files and makes them a checkpoint in :meth:`commit`.
 
-    Use as a context manager: leaving it by an exception removes what was written. The first
+    Use as a context manager: leaving it by an exception removes the folder. The first
     OSError is kept and everything after it skipped until ``commit`` raises it, because the other
     ranks take part in gathering tensors and must not be left waiting in the middle.
 
     Args:
         work_dir: the run's folder; the checkpoint goes to ``checkpoints/step-…`` in it.
-        step, epoch: what the checkpoint says of itself.
+        step, epoch: of the checkpoint, for its manifest.
         disk: the file operations.
         rank: only rank 0 makes, commits and removes the folder; what the others wrote reaches it
             by :meth:`rank_report` and :meth:`merge_reports`.
         final: another folder than that of the step.
-        what, go_on: what is written, and how to continue where it cannot be, for the message; by
+        what, go_on: name of the written thing, and how to continue, for error messages; by
             default a training's checkpoint.
     """
 
@@ -73,12 +72,7 @@ class CheckpointWriter:
         self.begin()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is not None:
             self.discard()
 
@@ -203,7 +197,7 @@ class CheckpointWriter:
         self.disk.sync_folder(self.final.parent)
 
     def discard(self) -> None:
-        """Remove what was written."""
+        """Remove the folder."""
         # A partial folder that cannot be removed either does no harm: readers ignore its name,
         # and the next save of this step removes it.
         with contextlib.suppress(OSError):
@@ -272,7 +266,7 @@ class Disk:
     """Plain POSIX file operations; every one raises OSError as the system does."""
 
     def make_folder(self, path: Path, parents: bool = False) -> None:
-        """By default in one that exists: what was removed meanwhile is not made again."""
+        """By default in one that exists: a work dir that was removed is not made again."""
         path.mkdir(parents=parents)
 
     def create(self, path: Path) -> BinaryIO:

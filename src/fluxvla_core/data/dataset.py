@@ -77,8 +77,8 @@ class ParquetDataset(Dataset):
             as JSON), for datasets that do not say: LeRobot's own.
 
     Raises:
-        DataError: a dataset is missing, empty, of another version, damaged, or does not have
-            what is asked for. Files are checked here, before training begins.
+        DataError: a dataset is missing, empty, of another version, damaged, or lacks a feature or
+            an episode. Files are checked here, before training begins.
         SpecMismatch: the datasets were made with different robots, or with another than
             ``embodiment``.
         ConfigError: parameters that make no sense.
@@ -230,11 +230,11 @@ class ParquetDataset(Dataset):
         """Several samples at once; their images are read in the order of the files."""
         self.prepare()
         places = [self._place(key.index) for key in keys]
-        steps = [step for place in places for step in self._steps(place)]
-        frames = iter(self._frames.read(steps))
+        steps = [self._steps(place) for place in places]
+        frames = iter(self._frames.read([step for each in steps for step in each]))
         return [
-            stack_steps([self._prepared(key, place, step, next(frames)) for step in steps])
-            for key, place, steps in zip(keys, places, map(self._steps, places), strict=True)
+            stack_steps([self._seen(key, place, row, next(frames)) for _, row in each])
+            for key, place, each in zip(keys, places, steps, strict=True)
         ]
 
     def _place(self, index: int) -> Place:
@@ -250,15 +250,10 @@ class ParquetDataset(Dataset):
         first = int(self.loaded[part].start[row])
         return [(part, max(row - back, first)) for back in reversed(range(self.n_obs_steps))]
 
-    def _prepared(
-        self, key: SampleKey, place: Place, step: Place, images: list[npt.NDArray[np.uint8]]
+    def _seen(
+        self, key: SampleKey, place: Place, seen: int, images: list[npt.NDArray[np.uint8]]
     ) -> Sample:
-        """What the transforms make of the sample at ``place`` as it looks at ``step``."""
-        return self._finish(self._raw(key.index, place, step[1], images), key)
-
-    def _raw(
-        self, index: int, place: Place, seen: int, images: list[npt.NDArray[np.uint8]]
-    ) -> Sample:
+        """What the transforms make of the sample at ``place`` as it looks at row ``seen``."""
         loaded, row = self.loaded[place[0]], place[1]
         first = row + self.window_start_idx - self.past_actions
         bounds = int(loaded.start[row]), int(loaded.end[row])
@@ -269,7 +264,7 @@ class ParquetDataset(Dataset):
             "action_masks": masks,
             "task_description": loaded.meta.tasks[loaded.task[row]],
             "timestamp": np.asarray(loaded.timestamp[row], np.float32),
-            "sample_ids": np.asarray(index, np.int64),
+            "sample_ids": np.asarray(key.index, np.int64),
             "stats": self.statistics[self.statistic_name],
             "info": {
                 "dataset": str(loaded.meta.root),
@@ -282,9 +277,6 @@ class ParquetDataset(Dataset):
             sample["img_masks"] = np.ones(len(images), np.bool_)
         if self.embodiment_id is not None:
             sample["embodiment_ids"] = np.asarray(self.embodiment_id, np.int64)
-        return sample
-
-    def _finish(self, sample: Sample, key: SampleKey) -> Sample:
         sample = self.pipeline(sample, sample_rng(self.seed, key.epoch, key.index))
         # The same for every sample, and with one row a step too much to send from workers.
         sample.pop("stats", None)

@@ -45,7 +45,7 @@ class Example:
         states, actions: their widths before the transforms.
         cameras: name -> height and width in the data; None where they are not known.
         dataset: None where the sample is assumed.
-        assumed: what is not known, and what was taken for it.
+        assumed: assumptions in place of missing knowledge.
     """
 
     sample: Sample

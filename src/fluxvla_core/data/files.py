@@ -122,13 +122,9 @@ def whole_numbers(table: Any, name: str, where: str) -> npt.NDArray[np.int64]:
     Raises:
         DataError: it holds other than whole numbers from 0 to 2^53, or gaps.
     """
-    pa = arrow()
-
     column = table[name].combine_chunks()
-    if pa.types.is_integer(column.type) and not column.null_count:
-        array = column.to_numpy(zero_copy_only=False)
-        if not len(array) or (array.min() >= 0 and array.max() < 1 << 53):
-            return np.asarray(array, np.int64)
+    if arrow().types.is_integer(column.type) and (array := _bounded(column)) is not None:
+        return array.astype(np.int64)
     raise DataError(f"{where}: column {name!r} must hold whole numbers from 0 on, no gaps")
 
 
@@ -138,15 +134,19 @@ def seconds(table: Any, name: str, where: str) -> npt.NDArray[np.float64]:
     Raises:
         DataError: it holds other than finite numbers from 0 on, or gaps.
     """
-    pa = arrow()
-
-    column = table[name].combine_chunks()
-    kind = column.type
-    if (pa.types.is_floating(kind) or pa.types.is_integer(kind)) and not column.null_count:
-        array = column.to_numpy(zero_copy_only=False).astype(np.float64)
-        if np.isfinite(array).all() and (array >= 0).all() and (array < 1 << 53).all():
-            return np.asarray(array)
+    column, types = table[name].combine_chunks(), arrow().types
+    number = types.is_floating(column.type) or types.is_integer(column.type)
+    if number and (array := _bounded(column)) is not None:
+        return array.astype(np.float64)
     raise DataError(f"{where}: column {name!r} must hold seconds from 0 on, no gaps")
+
+
+def _bounded(column: Any) -> npt.NDArray[Any] | None:
+    """A column of numbers without gaps, from 0 to 2^53; None for any other."""
+    if column.null_count:
+        return None
+    array: npt.NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return array if ((array >= 0) & (array < 1 << 53)).all() else None
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -134,8 +134,8 @@ def try_preparation(
 ) -> None:
     """Prepare a blank observation, and scale a chunk of zeros back.
 
-    What transforms and statistics refuse (a number of images, a width, a statistic that is not
-    there) is told at once, and with the checkpoint's name, not when the robot asks the first time.
+    Errors of transforms and statistics (a number of images, a width, a missing statistic) come at
+    once, and with the checkpoint's name, not when the robot asks the first time.
 
     Args:
         prepare, denormalize: of a ``LocalPolicy``.

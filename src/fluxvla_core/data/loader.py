@@ -45,7 +45,7 @@ class DictCollator(Collator):
         keys: stacked into tensors of shape ``(batch, ...)``; every sample needs equal shapes.
         meta_keys: kept as plain lists, one entry a sample.
 
-    What is left of normalising images (``image_scale``) is stacked without being listed.
+    ``image_scale``, which deferred normalisation adds, is stacked without being listed.
 
     Keys that are configured but that no sample has are left out: one list serves datasets with
     and without ``embodiment_ids``.
@@ -164,7 +164,7 @@ def make_loader(
 
 
 def on_device(device: torch.device) -> bool:
-    """Whether images are normalised there: it saves three quarters of what is copied to a GPU."""
+    """Whether images are normalised on ``device``: copies to a GPU then take a quarter."""
     return device.type == "cuda"
 
 

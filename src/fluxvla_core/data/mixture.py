@@ -34,7 +34,7 @@ class DistributedRepeatingDataset(Dataset):
     Datasets with the same ``statistic_name`` are of one robot and share statistics: those of all
     their frames together, exactly. Datasets of another robot need another ``statistic_name``.
 
-    What a checkpoint says about its robot and its rate is the first dataset's.
+    The robot, the rate and the shapes that a checkpoint names are the first dataset's.
 
     Args:
         datasets: tables (or objects) of one dataset or several; or name -> one or several, the
@@ -52,6 +52,13 @@ class DistributedRepeatingDataset(Dataset):
         SpecMismatch, DataError: datasets with one ``statistic_name`` of different robots, rates
             or widths.
     """
+
+    embodiment: EmbodimentSpec | None
+    fps: float | None
+    action_window_size: int | None
+    n_obs_steps: int
+    past_actions: int
+    pipeline: Any
 
     def __init__(
         self,
@@ -71,6 +78,10 @@ class DistributedRepeatingDataset(Dataset):
         self._first_id = np.cumsum(self.lengths) - self.lengths
         self._drawn: dict[tuple[int, int], Ints] = {}
         self._share_statistics()
+        first = self.datasets[0]
+        self.embodiment, self.fps = first.embodiment, first.fps
+        self.action_window_size, self.pipeline = first.action_window_size, first.pipeline
+        self.n_obs_steps, self.past_actions = first.n_obs_steps, first.past_actions
 
     def __len__(self) -> int:
         return int(self._places[-1])
@@ -79,36 +90,6 @@ class DistributedRepeatingDataset(Dataset):
     def statistics(self) -> dict[str, Any]:
         """``{statistic_name: {"proprio": {...}, "action": {...}}}``, one entry a robot."""
         return {name: entry for d in self.datasets for name, entry in d.statistics.items()}
-
-    @property
-    def embodiment(self) -> EmbodimentSpec | None:
-        """The first dataset's robot."""
-        return self.datasets[0].embodiment
-
-    @property
-    def fps(self) -> float | None:
-        """The first dataset's."""
-        return self.datasets[0].fps
-
-    @property
-    def action_window_size(self) -> int | None:
-        """The first dataset's."""
-        return self.datasets[0].action_window_size
-
-    @property
-    def n_obs_steps(self) -> int:
-        """The first dataset's."""
-        return self.datasets[0].n_obs_steps
-
-    @property
-    def past_actions(self) -> int:
-        """The first dataset's."""
-        return self.datasets[0].past_actions
-
-    @property
-    def pipeline(self) -> Any:
-        """The first dataset's."""
-        return self.datasets[0].pipeline
 
     @property
     def parts(self) -> dict[str, int]:

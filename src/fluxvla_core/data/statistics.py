@@ -323,7 +323,7 @@ def find_idle_dimensions(
 
     Args:
         what: put before the names.
-        scale: what is divided by, as wide as the statistics.
+        scale: the divisors, as wide as the statistics.
         names: of the dimensions; their numbers are used where there are none.
         mask: ``(D,)``; False where nothing is divided.
     """

@@ -115,7 +115,7 @@ def static(inputs: Tensors) -> dict[str, Tensor]:
 
 
 def copy_into(memory: Tensors, values: Tensors) -> None:
-    """Copy ``values`` to ``memory`` of the same names in few launches; what is there already stays.
+    """Copy ``values`` to ``memory`` of the same names in few launches; equal tensors are skipped.
 
     Raises:
         ValueError: other names, shapes or dtypes.
@@ -388,7 +388,7 @@ class Transfer:
         self._kept: dict[str, Tensor] = {}
 
     def to_device(self, batch: Mapping[str, Any]) -> dict[str, Any]:
-        """The tensors of ``batch`` on the device; what is no tensor stays as it is."""
+        """The tensors of ``batch`` on the device; other values stay as they are."""
         return {
             key: self._sent(key, value) if isinstance(value, Tensor) else value
             for key, value in batch.items()

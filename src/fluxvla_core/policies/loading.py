@@ -158,7 +158,7 @@ def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
             ``work_dir``. A damaged checkpoint of a work dir is passed over with a warning.
 
     Raises:
-        CheckpointError: there is none; the message says what is wrong with damaged ones.
+        CheckpointError: there is none; the message describes damaged ones.
     """
     if ckpt_path is not None and not folders(ckpt_path):
         return Checkpoint.open(ckpt_path).path
@@ -187,7 +187,7 @@ def _model(checkpoint: Checkpoint, device: str) -> Any:
 
 
 def _try(prepare: Any, denormalize: Any, robot: EmbodimentSpec, horizon: int, where: str) -> None:
-    """Try them before weights are read; cameras that the robot lacks are told by what drives it."""
+    """Try them before weights are read; the runner reports cameras that the robot lacks."""
     sizes = {camera.name: (camera.height, camera.width) for camera in robot.cameras}
     keys = getattr(prepare, "img_keys", ())
     if all(camera_name(key) in sizes for key in keys):

@@ -337,10 +337,9 @@ class Scaling:
 
     ``physical = offset + slope * normalized``, both ``(T, D)``; the model's rows are wider.
 
-    A checkpoint, or a config, says how a model's actions become a robot's
-    (``denormalize_action``). What undoes that is not said, and may depend on the state (actions
-    relative to it). But whatever can be undone scales and shifts, element by element, so that two
-    of its answers tell it all.
+    A checkpoint, or a config, has the function from a model's actions to a robot's
+    (``denormalize_action``), which may depend on the state. Its inverse is found by probing: an
+    invertible one scales and shifts element by element, so that two of its values determine it.
     """
 
     offset: Array

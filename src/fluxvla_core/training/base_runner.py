@@ -144,7 +144,7 @@ class BaseTrainRunner(Strategy):
         distributed.stop(self.world, failed=outcome == "failed")
 
     def run_setup(self, n_train_examples: int) -> None:
-        """Join the other ranks, choose a checkpoint to resume from, and build what is trained.
+        """Join the other ranks, choose a checkpoint to resume from, build model and optimizer.
 
         The checkpoint is loaded by ``Trainer``, once the dataset is known.
 

@@ -43,7 +43,7 @@ LEFT_OUT = (
     "workspaces of kernels",
     "temporaries inside an operation",
 )
-"""What an estimate does not know of."""
+"""Memory that an estimate leaves out."""
 _VALUE = torch.ops.aten._local_scalar_dense.default
 _CAST = torch.ops.aten._to_copy.default
 
@@ -54,9 +54,9 @@ class Kept:
 
     Args:
         activations: storages that autograd keeps, without weights, buffers and the batch.
-        recomputed: what is left of them where the model's units are computed again: what goes into
-            them, and what is outside of them.
-        largest_unit: what the largest of these has inside, which is there again at its turn.
+        recomputed: those that stay where the model's units are computed again: the inputs of units,
+            and all outside of units.
+        largest_unit: those inside the largest unit, which are there again while it is recomputed.
         weight_copies: trained weights in the dtype that is computed in, which autocast makes.
         batch: the inputs.
     """
@@ -83,7 +83,7 @@ class Footprint:
         averages: the averaged weights (``ema_decay``).
         gathered: weights gathered from other processes, and gradients that are exchanged.
         weight_copies: weights in the dtype that is computed in.
-        activations: what autograd keeps; with recomputation what is left of it.
+        activations: kept by autograd; with recomputation the rest of them.
         recomputed: the activations of one block that is computed again.
         batch: the inputs.
     """
@@ -111,7 +111,7 @@ class Footprint:
 def footprint(
     layout: Layout, kept: Kept, optimizer: int, averaged: bool, recompute: bool
 ) -> Footprint:
-    """Put together what was counted.
+    """Add up the counted parts.
 
     Args:
         optimizer: bytes, of :func:`optimizer_bytes`.
@@ -170,17 +170,30 @@ def fake(model: nn.Module, gathered_as: Mapping[str, torch.dtype] | None = None)
     """
     from torch._subclasses.fake_tensor import FakeTensorMode
 
-    dtypes = gathered_as or {}
-    known: dict[int, Any] = {}
-    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
-        for name, parameter in model.named_parameters():
-            values = torch.empty(parameter.shape, dtype=dtypes.get(name, parameter.dtype))
-            known[id(parameter)] = nn.Parameter(values, parameter.requires_grad)
-        for buffer in model.buffers():
-            known[id(buffer)] = torch.empty(buffer.shape, dtype=buffer.dtype)
-    made = copy.deepcopy(model, known)
+    dtypes, mode = gathered_as or {}, FakeTensorMode(allow_non_fake_inputs=True)
+
+    def empty(name: str, tensor: Tensor) -> Tensor:
+        with mode:
+            return torch.empty(tensor.shape, dtype=dtypes.get(name, tensor.dtype))
+
+    made = _copied(model, empty)
     made.__dict__["_fake_mode"] = mode
     return made
+
+
+def on_meta(model: nn.Module) -> nn.Module:
+    """A copy of ``model`` whose tensors have shapes and no memory."""
+    return _copied(model, lambda name, tensor: tensor.detach().to("meta"))
+
+
+def _copied(model: nn.Module, make: Callable[[str, Tensor], Tensor]) -> nn.Module:
+    """A copy of ``model`` with other tensors: ``make(name, tensor)`` of each of its own."""
+    known: dict[int, Any] = {}
+    for name, parameter in model.named_parameters():
+        known[id(parameter)] = nn.Parameter(make(name, parameter), parameter.requires_grad)
+    for name, buffer in model.named_buffers():
+        known[id(buffer)] = make(name, buffer)
+    return copy.deepcopy(model, known)
 
 
 def kept_by_fake(model: nn.Module, batch: Mapping[str, Any], dtype: torch.dtype | None) -> Kept:
@@ -321,23 +334,8 @@ def known_peak(name: str, dtype: torch.dtype | None) -> float | None:
     """TFLOP/s of the device called ``name`` computing in ``dtype``; None if nobody says."""
     if dtype is not torch.bfloat16:
         return None
-    words = name.replace("-", " ").split()
-    return next((peak for part, peak in PEAK_TFLOPS if _within(part.split(), words)), None)
-
-
-def _within(part: list[str], words: list[str]) -> bool:
-    return any(words[i : i + len(part)] == part for i in range(len(words)))
-
-
-def on_meta(model: nn.Module) -> nn.Module:
-    """A copy of ``model`` whose tensors have shapes and no memory."""
-    known: dict[int, Any] = {}
-    for parameter in model.parameters():
-        bare = nn.Parameter(parameter.detach().to("meta"), parameter.requires_grad)
-        known[id(parameter)] = bare
-    for buffer in model.buffers():
-        known[id(buffer)] = buffer.detach().to("meta")
-    return copy.deepcopy(model, known)
+    words = f" {name.replace('-', ' ')} "
+    return next((peak for part, peak in PEAK_TFLOPS if f" {part} " in words), None)
 
 
 def training_flops(skeleton: nn.Module, arguments: Mapping[str, Any]) -> int:

@@ -85,18 +85,9 @@ def export(source: str | Path, target: str | Path) -> Path:
     }
     model = model_of(checkpoint)
     load_for_inference(model, checkpoint)
-    if target.exists():
-        target.rmdir()
-    with CheckpointWriter(
-        target.parent,
-        checkpoint.step,
-        checkpoint.epoch,
-        final=target,
-        what="the export",
-        go_on="export again, or name a folder on another disk; the checkpoint is as it was",
-    ) as writer:
-        TensorFile.full(ckpt.MODEL, weights_by_name(model), True).write(writer)
-        writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
+    kept = "export again, or name a folder on another disk; the checkpoint is as it was"
+    with _writer(target, checkpoint.step, checkpoint.epoch, "the export", kept) as writer:
+        _write_weights(writer, weights_by_name(model))
         writer.write_json(ckpt.CONFIG, {**config, "config": tree, "origins": origins})
         for name in sorted(checkpoint.manifest.files):
             if name in _COPIED or name.startswith(f"{ckpt.PROCESSORS}/"):
@@ -104,12 +95,21 @@ def export(source: str | Path, target: str | Path) -> Path:
         return writer.commit()
 
 
-def _verified(checkpoint: Checkpoint, name: str) -> bytes:
-    """What is copied is what its hash says, even if the file changes while this runs.
+def _writer(target: Path, step: int, epoch: int, what: str, go_on: str) -> CheckpointWriter:
+    """Writes a checkpoint to ``target``, which is absent or an empty folder."""
+    if target.exists():
+        target.rmdir()
+    return CheckpointWriter(target.parent, step, epoch, final=target, what=what, go_on=go_on)
 
-    Raises:
-        CheckpointError: it is not.
-    """
+
+def _write_weights(writer: CheckpointWriter, tensors: Mapping[str, Tensor]) -> None:
+    """All weights in one file: the model brings none of them itself."""
+    TensorFile.full(ckpt.MODEL, tensors, True).write(writer)
+    writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
+
+
+def _verified(checkpoint: Checkpoint, name: str) -> bytes:
+    """A file's content, hashed as it was read: the file may change while this runs."""
     content = read_bytes(checkpoint.path / name, CheckpointError)
     if hashlib.sha256(content).hexdigest() != checkpoint.manifest.files[name].sha256:
         raise CheckpointError(f"{name} was changed since it was saved", where=str(checkpoint.path))
@@ -170,18 +170,9 @@ def import_checkpoint(
         model = build_vla_from_cfg(found.model)
     tensors = _as_model_has_them(model, found, str(source))
     prepare_folder(target.parent, "folder to import to", "name another place for the import")
-    if target.exists():
-        target.rmdir()
-    with CheckpointWriter(
-        target.parent,
-        0,
-        0,
-        final=target,
-        what="the import",
-        go_on="import again, or name a folder on another disk; the source is as it was",
-    ) as writer:
-        TensorFile.full(ckpt.MODEL, tensors, True).write(writer)
-        writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
+    kept = "import again, or name a folder on another disk; the source is as it was"
+    with _writer(target, 0, 0, "the import", kept) as writer:
+        _write_weights(writer, tensors)
         writer.write_json(ckpt.CONFIG, _config(found, VLA.adapt(model)))
         writer.write_json(ckpt.ENVIRONMENT, environment())
         writer.write_json(ckpt.STATISTICS, dict(found.statistics))
@@ -238,13 +229,10 @@ def _as_model_has_them(model: nn.Module, found: ForeignCheckpoint, where: str) -
     for name, own in wanted.items():
         if id(own) not in owner:
             stored = found.tensors[name]
-            owner[id(own)] = stored[_all(stored)] if isinstance(stored, Stored) else stored
+            whole = tuple(slice(0, length) for length in stored.shape)
+            owner[id(own)] = stored[whole] if isinstance(stored, Stored) else stored
         tensors[name] = owner[id(own)]
     return tensors
-
-
-def _all(stored: Stored) -> tuple[slice, ...]:
-    return tuple(slice(0, length) for length in stored.shape)
 
 
 def _as_foreign(checkpoint: Checkpoint) -> ForeignCheckpoint:

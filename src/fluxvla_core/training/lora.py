@@ -7,6 +7,7 @@ trained is saved under ``adapter/`` of a checkpoint in peft's own layout; the ba
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -26,6 +27,16 @@ CONFIG = f"{FOLDER}/adapter_config.json"
 _PREFIX = "base_model.model."
 _OURS = re.compile(r"\.(?:modules_to_save|lora_\w+)\.default(?=\.|$)")
 _PEFTS = ("base_layer", "lora_dropout")  # what peft puts into every layer that gets an adapter
+
+
+def is_count(value: object, least: int) -> bool:
+    """Whether an option is a whole number from ``least`` up."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def is_positive(value: object) -> bool:
+    """Whether an option is a finite number above 0."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
 
 
 @dataclass(frozen=True)
@@ -83,11 +94,11 @@ class LoraOptions:
         }
         options = cls(**values)
         for key, fine, rule in (
-            ("rank", _whole(options.rank), "a whole number above 0"),
-            ("alpha", options.alpha is None or _number(options.alpha), "a positive number"),
+            ("rank", is_count(options.rank, 1), "a whole number above 0"),
+            ("alpha", options.alpha is None or is_positive(options.alpha), "a positive number"),
             (
                 "dropout",
-                options.dropout == 0 or (_number(options.dropout) and options.dropout < 1),
+                options.dropout == 0 or (is_positive(options.dropout) and options.dropout < 1),
                 "at least 0 and below 1",
             ),
             (
@@ -219,15 +230,15 @@ def _also_hit(names: Iterable[str], end: str) -> list[str]:
 
 def _longer_names(names: Sequence[str], end: str) -> str:
     """What to write for ``end``: as much of each name as no other module's name ends in."""
-    telling: list[str] = []
+    tails_found: list[str] = []
     for name in (n for n in names if _ends(n, end)):
         parts = name.split(".")
         tails = (".".join(parts[i:]) for i in reversed(range(len(parts))))
         tail = next((tail for tail in tails if not _also_hit(names, tail)), None)
         if tail is None:
             return f"no name tells {name!r} apart: give it another one in the model"
-        telling.append(repr(tail))
-    return f"write {_listed(telling)} instead"
+        tails_found.append(repr(tail))
+    return f"write {_listed(tails_found)} instead"
 
 
 def _check_untied(model: nn.Module, tied: Iterable[tuple[str, str]], where: str | None) -> None:
@@ -319,14 +330,6 @@ def _leaf_names(model: nn.Module) -> str:
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:8]) + (" …" if len(names) > 8 else "")
-
-
-def _whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and value > 0
 
 
 def _names(value: Sequence[Any]) -> bool:

@@ -36,7 +36,7 @@ class VLAMetric(Metric):
         run_dir: where trackers write; the work dir by default.
         run_id: the name that trackers show; the work dir's name by default. Which run of theirs
             goes on when this one does is kept in ``run_dir``.
-        hparams: what is recorded as the run's settings; the config by default.
+        hparams: recorded as the run's settings; the config by default.
         window_size: the ``loss`` of a record is the mean over N steps; with more than one,
             ``loss_raw`` is the step's own.
         grad_accumulation_steps: recorded with the settings; the runner's losses are already
@@ -114,7 +114,7 @@ class VLAMetric(Metric):
         return self._status
 
     def sync(self) -> None:
-        """Make what was pushed durable; called before a checkpoint is saved."""
+        """Sync the trackers' files; called before a checkpoint is saved."""
         for tracker in self._trackers:
             tracker.sync()
 
@@ -127,7 +127,7 @@ class VLAMetric(Metric):
         self._losses.extend(state["losses"])
 
     def finalize(self) -> None:
-        """Push what is left and close the trackers."""
+        """Push the last records and close the trackers."""
         self.push()
         for tracker in self._trackers:
             tracker.close()

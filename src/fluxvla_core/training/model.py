@@ -100,8 +100,8 @@ def compile_units(model: nn.Module, dynamic: bool | None = None, backend: str = 
         ConfigError: the model names no units.
     """
     units = _named_blocks(model, "compile_blocks", "blocks to compile")
-    # Blocks of one class share a method, of which torch compiles only so many sizes; it would run
-    # the blocks of further sizes as they are.
+    # torch compiles a method for so many sizes only, and blocks of one class share it; it would not
+    # compile the blocks of further sizes.
     limits = torch._dynamo.config
     limits.recompile_limit = max(limits.recompile_limit, len(units))
     for unit in units:

@@ -9,7 +9,7 @@ from typing import Any
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.resolve import LOADER_KEYS
 from fluxvla_core.errors import ConfigError, Problem, nearest
-from fluxvla_core.training.lora import LoraOptions, check_installed
+from fluxvla_core.training.lora import LoraOptions, check_installed, is_count, is_positive
 from fluxvla_core.training.optimizers import make_schedule
 
 DTYPES = ("bf16",)
@@ -126,32 +126,32 @@ class TrainOptions:
             "early_stop_patience",
         ):
             value = getattr(self, key)
-            need(key, value is None or _count(value, 1), "must be a whole number above 0")
+            need(key, value is None or is_count(value, 1), "must be a whole number above 0")
         for key in ("save_epoch_interval", "grad_accumulation_steps", "log_iter_interval"):
-            need(key, _count(getattr(self, key), 1), "must be a whole number above 0")
-        need("max_keep_ckpts", _count(self.max_keep_ckpts, 0), "must be 0 (keep all) or more")
-        need("seed", _count(self.seed, 0), "must be a whole number from 0 up")
-        need("learning_rate", _positive(self.learning_rate), "must be a positive number")
+            need(key, is_count(getattr(self, key), 1), "must be a whole number above 0")
+        need("max_keep_ckpts", is_count(self.max_keep_ckpts, 0), "must be 0 (keep all) or more")
+        need("seed", is_count(self.seed, 0), "must be a whole number from 0 up")
+        need("learning_rate", is_positive(self.learning_rate), "must be a positive number")
         need(
             "weight_decay",
-            self.weight_decay == 0 or _positive(self.weight_decay),
+            self.weight_decay == 0 or is_positive(self.weight_decay),
             "must be a number from 0 up",
         )
         need(
             "max_grad_norm",
-            self.max_grad_norm is None or _positive(self.max_grad_norm),
+            self.max_grad_norm is None or is_positive(self.max_grad_norm),
             "must be positive, or None for no clipping",
         )
         need(
             "ema_decay",
-            self.ema_decay is None or (_positive(self.ema_decay) and self.ema_decay < 1),
+            self.ema_decay is None or (is_positive(self.ema_decay) and self.ema_decay < 1),
             "must be above 0 and below 1, or None",
         )
         need("sampler", self.sampler in (None, "distributed"), "must be None or 'distributed'")
         need("mixed_precision_dtype", self.mixed_precision_dtype in DTYPES, f"must be in {DTYPES}")
         need(
             "peak_tflops",
-            self.peak_tflops is None or _positive(self.peak_tflops),
+            self.peak_tflops is None or is_positive(self.peak_tflops),
             "must be a positive number, or None",
         )
         for key in (
@@ -240,22 +240,20 @@ class LoaderOptions:
                 where=context.config_file,
                 next=f"{section} = dict(per_device_batch_size=…, dataset=dict(type=…))",
             )
-        known = LOADER_KEYS
         problems: list[tuple[str, str]] = []
-        for key in table:
-            if key not in known:
-                near = nearest(key, known)
-                hint = f"; did you mean {near!r}?" if near else f"; known: {', '.join(known)}"
-                problems.append((key, f"unknown key{hint}"))
-        size, workers, together = table.get(known[0]), table.get(known[1], 0), table.get(known[2])
-        if not _count(size, 1):
-            problems.append((known[0], f"must be a whole number above 0, got {size!r}"))
-        if not _count(workers, 0):
-            problems.append((known[1], f"must be a whole number from 0 up, got {workers!r}"))
-        if together is not None and not _count(together, 2):
-            problems.append(
-                (known[2], f"must be a whole number above 1, or None, got {together!r}")
-            )
+        for key in (key for key in table if key not in LOADER_KEYS):
+            near = nearest(key, LOADER_KEYS)
+            hint = f"did you mean {near!r}?" if near else f"known: {', '.join(LOADER_KEYS)}"
+            problems.append((key, f"unknown key; {hint}"))
+        size, workers, together = map(table.get, LOADER_KEYS, (None, 0, None))
+        for key, fine, rule in zip(
+            LOADER_KEYS,
+            (is_count(size, 1), is_count(workers, 0), together is None or is_count(together, 2)),
+            ("above 0", "from 0 up", "above 1, or None"),
+            strict=True,
+        ):
+            if not fine:
+                problems.append((key, f"must be a whole number {rule}, got {table.get(key)!r}"))
         if problems:
             raise ConfigError.from_problems(
                 tuple(
@@ -263,13 +261,4 @@ class LoaderOptions:
                     for k, what in problems
                 )
             )
-        return cls(int(table[known[0]]), int(workers), together)
-
-
-def _count(value: object, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
-
-
-def _positive(value: object) -> bool:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and 0 < float(value) < float("inf")  # type: ignore[arg-type]
+        return cls(size, workers, together)

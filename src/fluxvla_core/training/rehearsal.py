@@ -1,12 +1,13 @@
-"""A training that is put together without data, weights, memory or hardware: ``--dry-run``.
+"""Dry run of a training (``--dry-run``): built without data, weights, memory or hardware.
 
-What can be known is worked out from the dataset to the robot: shapes, cameras, statistics, limits,
-and the memory of each process. What cannot be, is said; nothing here ends the dry run.
+From the dataset to the robot: shapes, cameras, statistics, limits, and the memory of each process.
+What cannot be known is noted; nothing here ends the dry run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -35,6 +36,7 @@ from fluxvla_core.training.cost import (
     kept_by_fake,
     optimizer_bytes,
 )
+from fluxvla_core.training.lora import LoraOptions
 from fluxvla_core.training.model import ForwardArguments, Layout, check_observations, trainable
 from fluxvla_core.training.strategy import Strategy
 
@@ -44,7 +46,7 @@ PROCESSES = (1, 2, 4, 8)
 
 @dataclass
 class Rehearsal:
-    """What is known of a training before it runs.
+    """Results of a dry run.
 
     Args:
         robot: of ``inference.operator``.
@@ -55,10 +57,10 @@ class Rehearsal:
         action_shape: ``(T, D)`` of the model's chunks.
         memory: number of processes -> what each of them needs.
         precision: dtype that is computed in.
-        notes: what is not known, or does not fit.
+        notes: missing knowledge, and parts that do not fit together.
         skeleton: the model without memory, with its adapters.
         inputs: the batch itself.
-        refused: with what the training would end at its first batch.
+        refused: the error that would end the training at its first batch.
     """
 
     robot: EmbodimentSpec | None = None
@@ -78,7 +80,7 @@ class Rehearsal:
 
 
 def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
-    """Put together the training of ``context.section``, as far as that can be done.
+    """Build the training of ``context.section`` as far as possible.
 
     Args:
         context: with the config's tree.
@@ -93,7 +95,7 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
         rehearsal.parameters = sum(p.numel() for p in model.parameters())
         rehearsal.action_shape = VLA.adapt(model).action_shape
         if runner is not None and runner.lora is not None:
-            model = _with_adapters(model, runner, context, rehearsal.notes)
+            model = _with_adapters(model, runner.lora, context, rehearsal.notes)
     if model is not None:
         rehearsal.trained = sum(p.numel() for p in trainable(model).values())
     batch = _batch(context, rehearsal, runner)
@@ -193,10 +195,19 @@ def _count(
                 found.refused = error
                 continue
             what = "activations are" if inputs is not None else "memory is"
-            found.notes.append(f"{what} not known: {_told(error)}")
+            found.notes.append(f"{what} not known: {_one_line(error)}")
             continue
         found.activations_known = inputs is not None
         return
+
+
+@contextmanager
+def _noted(notes: list[str], what: str) -> Iterator[None]:
+    """Context manager: an error inside becomes a note, as the other results are still of use."""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001 - classes of plugins, and peft's
+        notes.append(f"{what}: {_one_line(error)}")
 
 
 def _robot(config: Mapping[str, Any], notes: list[str]) -> EmbodimentSpec | None:
@@ -204,36 +215,27 @@ def _robot(config: Mapping[str, Any], notes: list[str]) -> EmbodimentSpec | None
     table = section.get("operator") if isinstance(section, Mapping) else None
     if table is None:
         return None
-    try:
-        operator = Operator.adapt(build_operator_from_cfg(table))
-        try:
-            return operator.embodiment
-        finally:
-            operator.close()
-    except Exception as error:  # noqa: BLE001 - another's class; what is left is still of use
-        notes.append(f"the robot is not known: {_told(error)}")
-        return None
+    with (
+        _noted(notes, "the robot is not known"),
+        closing(Operator.adapt(build_operator_from_cfg(table))) as operator,
+    ):
+        return operator.embodiment
+    return None
 
 
 def _model(context: RunContext, notes: list[str]) -> nn.Module | None:
-    try:
+    with _noted(notes, "the model cannot be built without memory"):
         return on_meta(context)
-    except Exception as error:  # noqa: BLE001 - another's class
-        notes.append(f"the model cannot be built without memory: {_told(error)}")
-        return None
+    return None
 
 
 def _with_adapters(
-    model: nn.Module, runner: Strategy, context: RunContext, notes: list[str]
+    model: nn.Module, options: LoraOptions, context: RunContext, notes: list[str]
 ) -> nn.Module | None:
-    assert runner.lora is not None
-    try:
-        with torch.device("meta"):
-            lora.attach(model, runner.lora, context.where(f"{context.section}.lora"))
-    except Exception as error:  # noqa: BLE001 - peft's
-        notes.append(f"adapters cannot be put into the model: {_told(error)}")
-        return None
-    return model
+    with _noted(notes, "adapters cannot be put into the model"), torch.device("meta"):
+        lora.attach(model, options, context.where(f"{context.section}.lora"))
+        return model
+    return None
 
 
 def _runner(context: RunContext, notes: list[str]) -> BaseTrainRunner | None:
@@ -241,15 +243,12 @@ def _runner(context: RunContext, notes: list[str]) -> BaseTrainRunner | None:
     table = {**context.config[context.section], "metric": None, "tokenizer": None}
     config = {k: v for k, v in context.config.items() if k != "hooks"}
     config[context.section] = table
-    try:
+    with _noted(notes, "the runner cannot be built"):
         runner = build_runner_from_cfg(table, replace(context, config=config))
-    except Exception as error:  # noqa: BLE001 - another's class
-        notes.append(f"the runner cannot be built: {_told(error)}")
-        return None
-    if not isinstance(runner, BaseTrainRunner):
+        if isinstance(runner, BaseTrainRunner):
+            return runner
         notes.append(f"{type(runner).__name__} is no BaseTrainRunner: its memory is not known")
-        return None
-    return runner
+    return None
 
 
 def _batch(
@@ -270,7 +269,7 @@ def _batch(
         rehearsal.refused = error
         return None
     except Exception as error:  # noqa: BLE001 - datasets and transforms of others
-        rehearsal.notes.append(f"the batch is not known: {_told(error)}")
+        rehearsal.notes.append(f"the batch is not known: {_one_line(error)}")
         return None
     rehearsal.batch = {
         key: (tuple(value.shape), str(value.dtype).removeprefix("torch."))
@@ -320,8 +319,7 @@ def _compare(rehearsal: Rehearsal) -> None:
         )
 
 
-def _told(error: Exception) -> str:
-    """An error in one line."""
+def _one_line(error: Exception) -> str:
     text = error.what if isinstance(error, FluxError) else f"{type(error).__name__}: {error}"
     lines = text.strip().splitlines() or [type(error).__name__]
     return lines[0][:300]

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import FrameType, TracebackType
+from types import FrameType
 
 from fluxvla_core.errors import FluxError, RunFailed
 from fluxvla_core.signals import handling, requests_to_stop
@@ -46,12 +46,7 @@ class StopRequest:
         self._taken.enter_context(handling(self._handle, *requests_to_stop()))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *details: object) -> None:
         self._taken.close()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

@@ -20,11 +20,11 @@ from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
 from fluxvla_core.checkpoints.foreign import (
     HUB,
+    explain_other_family,
     foreign_folder,
     is_foreign,
     read_foreign,
     safetensors_in,
-    telling_families,
     torch_table,
 )
 from fluxvla_core.checkpoints.shards import Stored, StoredTensors
@@ -108,7 +108,7 @@ def weights_by_name(model: nn.Module, without: Iterable[str] = ()) -> dict[str, 
 def load_full_tensors(model: nn.Module, tensors: Mapping[str, Tensor | Stored]) -> None:
     """Load full ``tensors`` of the right names and sizes into ``model``, which may be sharded."""
     state = weights_by_name(model)
-    # strict=False only for what is left out of checkpoints: names and sizes have been checked.
+    # strict=False only for weights that are left out of checkpoints: the others were checked.
     model.load_state_dict(
         {name: shard_like(state[name].detach(), tensor) for name, tensor in tensors.items()},
         strict=False,
@@ -122,51 +122,44 @@ def check_model_tensors(
     saved: Mapping[str, Any],
     where: str,
 ) -> None:
-    """Refuse weights that are not all of this model's, or that other frozen parts go with.
+    """Refuse weights that are not all of this model's, or were trained with other frozen ones.
 
     Args:
         tensors: the checkpoint's weights.
-        brings: what the model says that it brings itself.
-        saved: what was left out of the checkpoint (``left_out`` of ``trainer.json``).
+        brings: the weights that the model brings itself.
+        saved: ``left_out`` of ``trainer.json``.
 
     Raises:
         CheckpointError: lists what differs.
     """
     brings = brings if saved.get("sha256") else LeftOut()
-    if lora.adapter_names(model):
-        _check_base(brings, saved, where)
-    check_left_out(brings, saved, where)
+    if brings.sha256 != saved.get("sha256", ""):
+        raise _other_frozen(brings, saved, bool(lora.adapter_names(model)), where)
     check_names(tensors, weights_by_name(model, brings.names), "the weights", where)
 
 
-def _check_base(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
+def _other_frozen(
+    ours: LeftOut, saved: Mapping[str, Any], adapter: bool, where: str
+) -> CheckpointError:
+    """Frozen weights, or an adapter's base, are not those that the checkpoint was trained with."""
+    what = "frozen weights differ from those that the checkpoint was trained with"
     now, before = ours.sources.get(""), saved.get("sources", {}).get("")
-    if ours.sha256 != saved.get("sha256", "") and now and before and now != before:
-        raise CheckpointError(
-            "frozen weights differ from those that the checkpoint was trained with (the model from "
-            f"{now}; then from {before})",
+    if adapter and now and before and now != before:
+        return CheckpointError(
+            f"{what} (the model from {now}; then from {before})",
             where=where,
             cause="init_from was changed, or that place has other weights by now",
             next=f"--set runner.init_from=DIR, where the weights of {before} are; or resume "
             "without it",
         )
-
-
-def check_left_out(ours: LeftOut, saved: Mapping[str, Any], where: str) -> None:
-    """Refuse frozen weights other than those that the checkpoint was trained with.
-
-    Raises:
-        CheckpointError: names where they come from.
-    """
-    if ours.sha256 != saved.get("sha256", ""):
-        places = {**saved.get("sources", {}), **ours.sources}
-        listed = "; ".join(f"{name or 'the model'} from {place}" for name, place in places.items())
-        raise CheckpointError(
-            f"frozen weights differ from those that the checkpoint was trained with ({listed})",
-            where=where,
-            cause="another version of the package or file that they come from is installed",
-            next="environment.json in the checkpoint's folder has the versions that made it",
-        )
+    places = {**saved.get("sources", {}), **ours.sources}
+    listed = "; ".join(f"{name or 'the model'} from {place}" for name, place in places.items())
+    return CheckpointError(
+        f"{what} ({listed})",
+        where=where,
+        cause="another version of the package or file that they come from is installed",
+        next="environment.json in the checkpoint's folder has the versions that made it",
+    )
 
 
 def model_of(checkpoint: Checkpoint) -> nn.Module:
@@ -283,7 +276,7 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
 
     Args:
         place: a checkpoint's folder, a work dir (its newest one), a safetensors file, or another
-            project's checkpoint, of which a plugin has the format.
+            project's checkpoint whose format a plugin reads.
 
     Returns:
         The file, or the folder of the checkpoint itself: which one is a work dir's newest, or its
@@ -294,13 +287,13 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
     """
     if is_foreign(place):
         theirs = read_foreign(place)
-        with telling_families(theirs.model, model):
+        with explain_other_family(theirs.model, model):
             return _put_all(model, theirs.tensors, foreign_folder(place).resolve())
     path = Path(os.path.realpath(place))
     if path.suffix != ".safetensors":
         checkpoint = Checkpoint.open(path)
         checkpoint.verify()
-        with telling_families(checkpoint.config().get("model"), model):
+        with explain_other_family(checkpoint.config().get("model"), model):
             load_for_inference(model, checkpoint)
         return checkpoint.path
     if not path.is_file():
@@ -348,7 +341,7 @@ def put_parts(model: nn.Module, parts: Sequence[PartWeights]) -> None:
 
     Raises:
         CheckpointError: a file is missing or damaged, or its tensors are not those of the part;
-            lists what is missing, left over or of another size.
+            lists missing and left-over ones, and those of another size.
     """
     for part in parts:
         load_full_tensors(model, matched(tensors_at(part.place), weights_by_name(model), part))

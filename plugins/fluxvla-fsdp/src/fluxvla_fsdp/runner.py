@@ -56,16 +56,12 @@ class FSDPTrainRunner(BaseTrainRunner):
         from torch.distributed.fsdp import fully_shard
 
         from fluxvla_core.training import refuse_scalars, trainable
-        from fluxvla_fsdp.groups import groups_of
-        from fluxvla_fsdp.ties import check_ties
+        from fluxvla_fsdp.groups import check_ties, groups_of
 
         refuse_scalars(trainable(vla), type(self).__name__, self.context.where("model"))
         check_ties(vla, self.context.where("model"))
         frozen = {p for p in vla.parameters() if not p.requires_grad}
-        shared: dict[str, Any] = {
-            "mesh": self._mesh(),
-            "ignored_params": frozen,
-        }
+        shared: dict[str, Any] = {"mesh": self._mesh(), "ignored_params": frozen}
         compute, fp32 = self._precision(self.compute_dtype), self._precision(None)
         for group in groups_of(vla, self._reshards, self.compute_dtype, self.world.device.type):
             fully_shard(

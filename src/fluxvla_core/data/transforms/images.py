@@ -13,6 +13,7 @@ serves every normaliser, and each sample of a batch has its own numbers.
 from __future__ import annotations
 
 import operator
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -214,7 +215,27 @@ class RandomShiftImages(RandomTransform):
         return image[:, rows[:, None], columns]
 
 
-class NormalizeImages(Transform):
+class _Normalizer(Transform):
+    """Base of transforms that normalise images plane by plane, now or on the device."""
+
+    def __call__(self, sample: Sample) -> Sample:
+        images = _float_planes(sample["images"])
+        return {**sample, "images": scale_(images, self._steps(len(images) // 3))}
+
+    def defer(self, sample: Sample) -> Sample:
+        """Leave it to the device; gives ``(3N, H, W)``, uint8 if the images still are."""
+        images = stack_images(sample["images"])
+        if images.dtype != np.uint8:
+            images = _float_planes(images)
+        planes = len(images)
+        return {**sample, "images": images, SCALE: as_array(self._steps(planes // 3), planes)}
+
+    @abstractmethod
+    def _steps(self, cameras: int) -> Steps:
+        """What to compute with the planes of so many cameras."""
+
+
+class NormalizeImages(_Normalizer):
     """Normalise by mean and std: ``(x - mean) / (std + 1e-8)``; gives ``(3N, H, W)`` float32.
 
     Args:
@@ -242,13 +263,6 @@ class NormalizeImages(Transform):
             raise ConfigError("NormalizeImages: every std must be positive")
         self.scale_to_unit_interval = scale_to_unit_interval
 
-    def __call__(self, sample: Sample) -> Sample:
-        return _normalize(sample, self._steps)
-
-    def defer(self, sample: Sample) -> Sample:
-        """Leave it to the device; gives ``(3N, H, W)``, uint8 if the images still are."""
-        return _defer(sample, self._steps)
-
     def _steps(self, cameras: int) -> Steps:
         if len(self.means) not in (1, cameras):
             raise ConfigError(
@@ -261,15 +275,8 @@ class NormalizeImages(Transform):
         return unit, None, means, stds + np.float32(1e-8)
 
 
-class SimpleNormalizeImages(Transform):
+class SimpleNormalizeImages(_Normalizer):
     """Normalise to -1..1: ``x / 255 * 2 - 1``; gives ``(3N, H, W)`` float32."""
-
-    def __call__(self, sample: Sample) -> Sample:
-        return _normalize(sample, self._steps)
-
-    def defer(self, sample: Sample) -> Sample:
-        """Leave it to the device; gives ``(3N, H, W)``, uint8 if the images still are."""
-        return _defer(sample, self._steps)
 
     def _steps(self, cameras: int) -> Steps:
         factor, one = (np.full(3 * cameras, v, np.float32) for v in (2 / 255, 1))
@@ -378,19 +385,6 @@ def as_array(steps: Steps, planes: int) -> npt.NDArray[np.float32]:
         for row, nothing in zip(steps, _NOTHING, strict=True)
     ]
     return np.stack(rows)
-
-
-def _normalize(sample: Sample, steps: Callable[[int], Steps]) -> Sample:
-    images = _float_planes(sample["images"])
-    return {**sample, "images": scale_(images, steps(len(images) // 3))}
-
-
-def _defer(sample: Sample, steps: Callable[[int], Steps]) -> Sample:
-    images = stack_images(sample["images"])
-    if images.dtype != np.uint8:
-        images = _float_planes(images)
-    planes = len(images)
-    return {**sample, "images": images, SCALE: as_array(steps(planes // 3), planes)}
 
 
 def _float_planes(images: Images) -> npt.NDArray[np.float32]:

@@ -51,7 +51,7 @@ class Pipeline:
                 try:
                     sample = cast(Transform, transform)(sample)
                 except KeyError as error:
-                    _tell_missing(transform, sample, error)
+                    _explain_missing(transform, sample, error)
                     raise
                 continue
             if rng is None:
@@ -121,7 +121,7 @@ def deferring(dataset: Any) -> Any:
 def declared(thing: object, name: str, method: str) -> Any:
     """The attribute ``name`` of the class that defines ``thing``'s ``method``; None without one.
 
-    A subclass that overrides ``method`` does not inherit what was declared of the old one, and a
+    A subclass that overrides ``method`` does not inherit the declarations about the old one, and a
     wrapper that delegates attributes declares nothing.
     """
     owner = next((cls for cls in type(original(thing)).__mro__ if method in vars(cls)), object)
@@ -143,7 +143,7 @@ _OF_A_SAMPLE = {
 """What a transform may look for in a sample -> why it may not be there."""
 
 
-def _tell_missing(transform: Any, sample: Sample, error: KeyError) -> None:
+def _explain_missing(transform: Any, sample: Sample, error: KeyError) -> None:
     key = error.args[0] if error.args else None
     if key in _OF_A_SAMPLE and key not in sample:
         raise ConfigError(

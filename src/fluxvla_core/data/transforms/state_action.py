@@ -39,7 +39,7 @@ class NormalizeStatesAndActions(Transform):
         action_norm_mask: ``(D,)``, D being the data's own width; False neither shifts nor scales
             a dimension (relative ones are counted from the state all the same).
         std_floor: no dimension is divided by less than this, in the data's units.
-        epsilon: added to what is divided by: 1e-6 in openpi, 1e-8 in LeRobot.
+        epsilon: added to the divisor: 1e-6 in openpi, 1e-8 in LeRobot.
         epsilon_if_zero: ranges (``quantile``, ``min_max``) get it only where they are 0, as
             LeRobot has it.
 
@@ -126,7 +126,7 @@ class NormalizeStatesAndActions(Transform):
         moved = list(find_idle_dimensions("action", entries[1], action.scale, actions, mask))
         found = [
             *find_idle_dimensions("state", entries[0], state.scale, states),
-            # One that never moves does no harm here: whatever a model says of it, it stays there.
+            # One that never moves does no harm here: it stays there, whatever a model predicts.
             *(dimension for dimension in moved if dimension.blown_up),
         ]
         who = f"{type(self).__name__}(norm_type={self.norm_type!r}, std_floor={self.std_floor:g})"
@@ -152,25 +152,15 @@ class NormalizeStatesAndActions(Transform):
     def _scales(self, stats: Any) -> tuple[Affine, Affine]:
         if self._known is None or self._known[0] is not stats:
             who = type(self).__name__
-            state = make_affine(
-                _entry(stats, self.state_key, who),
-                self.state_norm_type,
-                who,
-                self.std_floor,
-                None,
-                self.epsilon,
-                self.epsilon_if_zero,
+            state, action = (_entry(stats, key, who) for key in (self.state_key, self.action_key))
+            shared = {"epsilon": self.epsilon, "epsilon_if_zero": self.epsilon_if_zero}
+            self._known = (
+                stats,
+                make_affine(state, self.state_norm_type, who, self.std_floor, **shared),
+                make_affine(
+                    action, self.norm_type, who, self.std_floor, self.action_norm_mask, **shared
+                ),
             )
-            action = make_affine(
-                _entry(stats, self.action_key, who),
-                self.norm_type,
-                who,
-                self.std_floor,
-                self.action_norm_mask,
-                self.epsilon,
-                self.epsilon_if_zero,
-            )
-            self._known = (stats, state, action)
         return self._known[1:]
 
     def _pad(self, values: Floats, dim: int | None, what: str) -> npt.NDArray[np.float32]:

@@ -117,10 +117,12 @@ def test_a_file_that_cannot_be_read_is_named_and_passed_over(tmp_path, monkeypat
         return read(path)
 
     monkeypatch.setattr(checkpoint, "hash_file", failing)
-    assert not Checkpoint.open(second).is_whole()
     found, (refused,) = newest_whole(tmp_path)
     assert found.path == first
-    assert str(refused) == (
+    assert refused.what == "model.safetensors cannot be read: Input/output error"
+    with pytest.raises(CheckpointError) as caught:
+        Checkpoint.open(second).verify()
+    assert str(caught.value) == (
         f"{second}: model.safetensors cannot be read: Input/output error\n"
         "  likely cause: its permissions, or a disk or mount that fails\n"
         f"  next: the one before it is whole: {first}"

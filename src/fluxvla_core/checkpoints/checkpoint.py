@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -134,25 +135,19 @@ class Checkpoint:
         """
         damage = self._damage()
         if damage is not None:
-            problem, cause = damage
-            raise CheckpointError(
-                problem, where=str(self.path), cause=cause, next=_offer_previous(self.path)
-            )
+            damage.next = _offer_previous(self.path)
+            raise damage
 
-    def _damage(self) -> tuple[str, str] | None:
-        """The first damaged file, what is wrong with it, and its likely cause."""
+    def _damage(self) -> CheckpointError | None:
+        """The first damaged file, and its likely cause."""
         for name, entry in sorted(self.manifest.files.items()):
             try:
-                problem = _difference(self.path / name, entry)
+                problem, cause = _difference(self.path / name, entry), _CHANGED
             except OSError as error:
-                return f"{name} cannot be read: {error.strerror or error}", _UNREADABLE
+                problem, cause = f"cannot be read: {error.strerror or error}", _UNREADABLE
             if problem:
-                return f"{name} is {problem}", _CHANGED
+                return CheckpointError(f"{name} {problem}", where=str(self.path), cause=cause)
         return None
-
-    def is_whole(self) -> bool:
-        """Whether :meth:`verify` would pass."""
-        return self._damage() is None
 
     def has(self, name: str) -> bool:
         """Whether the checkpoint has the file ``name``."""
@@ -242,13 +237,13 @@ class Checkpoint:
 def _difference(path: Path, entry: FileEntry) -> str | None:
     """How the file at ``path`` differs from its entry in the manifest."""
     if not path.is_file():
-        return "missing from the checkpoint"
+        return "is missing from the checkpoint"
     size = path.stat().st_size
     if size != entry.size:
-        return f"damaged: {size} bytes instead of {entry.size}"
+        return f"is damaged: {size} bytes instead of {entry.size}"
     found = hash_file(path)
     if found != entry.sha256:
-        return f"damaged: SHA-256 {found[:12]}… instead of {entry.sha256[:12]}…"
+        return f"is damaged: SHA-256 {found[:12]}… instead of {entry.sha256[:12]}…"
     return None
 
 
@@ -306,27 +301,28 @@ def newest_whole(place: str | Path) -> tuple[Checkpoint | None, list[CheckpointE
     refused: list[CheckpointError] = []
     for folder in reversed(folders(place)):
         try:
-            checkpoint = Checkpoint.open(folder)
-            checkpoint.verify()
+            return _whole(folder), refused
         except CheckpointError as error:
             refused.append(error)
-        else:
-            return checkpoint, refused
     return None, refused
+
+
+def _whole(folder: Path) -> Checkpoint:
+    """The verified checkpoint in ``folder``; if it is damaged, no other one is looked for."""
+    checkpoint = Checkpoint(folder, read_manifest(folder))
+    damage = checkpoint._damage()
+    if damage is not None:
+        raise damage
+    return checkpoint
 
 
 def _offer_previous(path: Path) -> str | None:
     """Text that names the newest undamaged checkpoint before ``path``."""
     step = step_of(path)
     for folder in reversed(folders(path.parent)):
-        if step is None or (step_of(folder) or 0) >= step:
-            continue
-        try:
-            whole = Checkpoint(folder, read_manifest(folder)).is_whole()
-        except CheckpointError:
-            continue
-        if whole:
-            return f"the one before it is whole: {folder}"
+        if step is not None and (step_of(folder) or 0) < step:
+            with suppress(CheckpointError):
+                return f"the one before it is whole: {_whole(folder).path}"
     return None
 
 

@@ -111,13 +111,12 @@ class Metadata:
     @property
     def vectors(self) -> list[str]:
         """The features that are one vector of float32 or float64 a frame."""
-        return [
-            k
-            for k, f in self.features.items()
-            if f["dtype"].startswith("float")
-            and len(f["shape"]) == 1
-            and k not in lerobot.INDEX_FEATURES
-        ]
+        return [k for k in self._numeric() if len(self.features[k]["shape"]) == 1]
+
+    def _numeric(self) -> list[str]:
+        """The features of floating-point numbers, of any shape."""
+        floats = (k for k, f in self.features.items() if f["dtype"].startswith("float"))
+        return [k for k in floats if k not in lerobot.INDEX_FEATURES]
 
     def data_file(self, file: FileId) -> Path:
         return self.root / fill(self.info["data_path"], _numbers(file))
@@ -155,11 +154,7 @@ class Metadata:
         Raises:
             DataError: there is none, or it is not a vector of numbers.
         """
-        numbers = [
-            k
-            for k, f in self.features.items()
-            if f["dtype"].startswith("float") and k not in lerobot.INDEX_FEATURES
-        ]
+        numbers = self._numeric()
         if name not in self.features:
             raise DataError(f"{self.root}: there is no feature {name!r}{self.hint(name, numbers)}")
         feature = self.features[name]

@@ -81,9 +81,8 @@ class VLAMetric(Metric):
             "grad_accumulation_steps": self.grad_accumulation_steps,
             **(config if self.hparams is None else self.hparams),
         }
-        arguments = (self.run_dir, self.run_id, step, settings)
         self._trackers = [
-            Guarded(name, self.context.reporter, partial(_KINDS[name][0], *arguments))
+            open_tracker(name, self.context.reporter, self.run_dir, self.run_id, step, settings)
             for name in self.active_trackers
         ]
 
@@ -327,6 +326,13 @@ class Guarded:
                 f"tracker {self._name} failed and is left out for the rest of the run: "
                 f"{type(error).__name__}: {error}"
             )
+
+
+def open_tracker(
+    name: str, reporter: Reporter, run_dir: Path, run_id: str, step: int, hparams: Mapping[str, Any]
+) -> Guarded:
+    """The tracker ``name``, guarded; ``step`` steps of the run have been done before."""
+    return Guarded(name, reporter, partial(_KINDS[name][0], run_dir, run_id, step, hparams))
 
 
 def _identity(tracker: str, run_dir: Path, step: int) -> str:

@@ -245,12 +245,16 @@ class LoaderOptions:
             near = nearest(key, LOADER_KEYS)
             hint = f"did you mean {near!r}?" if near else f"known: {', '.join(LOADER_KEYS)}"
             problems.append((key, f"unknown key; {hint}"))
-        size, workers, together = map(table.get, LOADER_KEYS, (None, 0, None))
-        for key, fine, rule in zip(
-            LOADER_KEYS,
-            (is_count(size, 1), is_count(workers, 0), together is None or is_count(together, 2)),
-            ("above 0", "from 0 up", "above 1, or None"),
-            strict=True,
+        options = cls(
+            table.get("per_device_batch_size", 0),
+            table.get("per_device_num_workers", 0),
+            table.get("shuffle_episodes"),
+        )
+        together = options.shuffle_episodes
+        for key, fine, rule in (
+            ("per_device_batch_size", is_count(options.per_device_batch_size, 1), "above 0"),
+            ("per_device_num_workers", is_count(options.per_device_num_workers, 0), "from 0 up"),
+            ("shuffle_episodes", together is None or is_count(together, 2), "above 1, or None"),
         ):
             if not fine:
                 problems.append((key, f"must be a whole number {rule}, got {table.get(key)!r}"))
@@ -261,4 +265,4 @@ class LoaderOptions:
                     for k, what in problems
                 )
             )
-        return cls(size, workers, together)
+        return options

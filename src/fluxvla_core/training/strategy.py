@@ -380,11 +380,15 @@ class Strategy(TrainRunner):
 
     @cached_property
     def compute_dtype(self) -> torch.dtype | None:
-        """The dtype of the forward pass; None for the weights' own fp32."""
-        from fluxvla_core.training.model import compute_dtype
+        """The dtype of matrix products; None for the weights' own fp32.
 
-        options = self.options
-        return compute_dtype(options.enable_mixed_precision_training, options.mixed_precision_dtype)
+        Weights, gradients and optimizer state stay fp32: in bf16 a parameter of 1.0 does not move
+        under steps of 5e-5. fp16 is not offered: it needs loss scaling, and where it is fast bf16
+        is.
+        """
+        import torch
+
+        return torch.bfloat16 if self.options.enable_mixed_precision_training else None
 
     @property
     def total_steps(self) -> int:

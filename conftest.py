@@ -96,6 +96,6 @@ def reason_of(report: pytest.TestReport) -> str:
 def _forget_plugin_files() -> Iterator[None]:
     """What a test loaded with ``--plugin FILE`` is not there for the next one."""
     yield
-    files = sys.modules.get("fluxvla_core.plugins.files")
+    files = sys.modules.get("fluxvla_core.plugins.registry")
     if files is not None:
         files.forget_plugin_files()

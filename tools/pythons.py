@@ -47,7 +47,7 @@ TESTED = (
     "tests/evaluation",
     "tests/plugins",
     "tests/robot",
-    "tests/spec",
+    "tests/test_spec.py",
     "tests/test_hooks.py",
     "tests/test_registries.py",
     "tests/testing/test_action_filter_kit.py",

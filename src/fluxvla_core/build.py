@@ -17,7 +17,7 @@ from fluxvla_core.config.resolve import INJECTED
 from fluxvla_core.config.runtime_signature import misfits, option_names
 from fluxvla_core.config.signature import OPTIONS_KEYWORDS
 from fluxvla_core.config.tree import join_key
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
 from fluxvla_core.registries import ROWS, RegistryRow

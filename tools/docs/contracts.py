@@ -161,7 +161,7 @@ PAGES = (
         "The data that the contracts exchange.",
         {
             _CONTRACTS.format("frame"): ("Frame", "Observation"),
-            "spec/embodiment.py": ("EmbodimentSpec", "Joint", "Camera"),
+            "spec.py": ("EmbodimentSpec", "Joint", "Camera"),
         },
     ),
 )

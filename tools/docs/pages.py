@@ -23,7 +23,7 @@ _CONTRACTS = "src/fluxvla_core/contracts"
 _REFERENCE = {
     f"{_CONTRACTS}/robot.py": "reference/operator.md",
     f"{_CONTRACTS}/frame.py": "reference/records.md",
-    "src/fluxvla_core/spec/embodiment.py": "reference/records.md",
+    "src/fluxvla_core/spec.py": "reference/records.md",
     f"{_CONTRACTS}/policy.py": "reference/policy.md",
     f"{_CONTRACTS}/environment.py": "reference/environment.md",
     f"{_CONTRACTS}/training.py": "reference/training.md",

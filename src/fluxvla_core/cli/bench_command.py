@@ -16,7 +16,7 @@ from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.load import load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.errors import ConfigError, UsageError
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 if TYPE_CHECKING:
     from fluxvla_core.policies.local import LocalPolicy

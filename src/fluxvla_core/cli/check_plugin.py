@@ -92,7 +92,7 @@ class CheckPlugin:
         add_plugin_files(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.plugins.files import load_plugin_files
+        from fluxvla_core.plugins.registry import load_plugin_files
 
         if importlib.util.find_spec("pytest") is None:
             raise UsageError("the kits need pytest, which is not installed", next=INSTALL)

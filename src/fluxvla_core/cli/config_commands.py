@@ -19,7 +19,7 @@ from fluxvla_core.config.load import CONFIG_FILE, load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.config.tree import Config, join_key, leaves
 from fluxvla_core.errors import EXIT_DONE, UsageError
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 
 class Show:

@@ -170,7 +170,7 @@ def _log_format(parser: Parser) -> None:
 
 @contextmanager
 def _reporter(log_format: str, stream: TextIO) -> Iterator[Any]:
-    from fluxvla_core.cli.choose_reporter import make_reporter
+    from fluxvla_core.cli.reporters import make_reporter
 
     reporter = make_reporter(log_format, stream)
     try:
@@ -235,9 +235,9 @@ class Collect:
         )
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.config.hints import whole_options
+        from fluxvla_core.config.overrides import whole_options
         from fluxvla_core.evaluation.collect import Collection
-        from fluxvla_core.plugins.files import load_plugin_files
+        from fluxvla_core.plugins.registry import load_plugin_files
 
         load_plugin_files(args.plugin_files)
         tables = arguments(args.env, args.policy, args.arguments)
@@ -260,8 +260,7 @@ class Collect:
 
 def collect_demonstrations(collection: Collection, args: argparse.Namespace) -> None:
     """Collect demonstrations as ``args`` says (out, workers, resume, log_format), with progress."""
-    from fluxvla_core.cli.choose_reporter import make_reporter
-    from fluxvla_core.cli.reporters import KeepAliveReporter
+    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
     from fluxvla_core.evaluation.collect import collect
 
     reporter = KeepAliveReporter(make_reporter(args.log_format))

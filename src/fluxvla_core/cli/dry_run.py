@@ -11,7 +11,7 @@ from fluxvla_core.cli.plan import Plan
 
 if TYPE_CHECKING:
     from fluxvla_core.errors import FluxError
-    from fluxvla_core.spec.embodiment import EmbodimentSpec
+    from fluxvla_core.spec import EmbodimentSpec
     from fluxvla_core.training.footprint import Footprint
     from fluxvla_core.training.rehearsal import Rehearsal
 

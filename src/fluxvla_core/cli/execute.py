@@ -14,7 +14,7 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.cli.plan import Plan
 from fluxvla_core.config.load import CONFIG_FILE
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.signals import handling, requests_to_stop
 
@@ -26,10 +26,9 @@ def execute(plan: Plan, args: argparse.Namespace) -> int:
         The signal that asked to stop it when it was done, or 0.
     """
     from fluxvla_core.build import RunContext, build_runner_from_cfg
-    from fluxvla_core.cli.choose_reporter import make_reporter
-    from fluxvla_core.cli.reporters import KeepAliveReporter
+    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
     from fluxvla_core.config.tree import freeze
-    from fluxvla_core.contracts.reporter import SilentReporter
+    from fluxvla_core.contracts.runner import SilentReporter
 
     context = RunContext(
         config=freeze(plan.config.tree),
@@ -93,7 +92,7 @@ def _run_section(
     Returns:
         What the section gave, and the signal that asked to stop it when it was done, or 0.
     """
-    from fluxvla_core.config.hints import whole_options
+    from fluxvla_core.config.overrides import whole_options
 
     with whole_options(plan.config.tree, plan.section):
         return _driven(plan, build, context, own_records)
@@ -138,7 +137,7 @@ def _leave_records(plan: Plan) -> bool:
 
 def _write_records(plan: Plan, folder: Path) -> None:
     from fluxvla_core import atomic
-    from fluxvla_core.config.snapshot import ENVIRONMENT_FILE, environment, write_resolved
+    from fluxvla_core.config.load import ENVIRONMENT_FILE, environment, write_resolved
 
     folder.mkdir(parents=True, exist_ok=True)
     write_resolved(folder / CONFIG_FILE, plan.config)
@@ -161,7 +160,7 @@ def remove_folders(made: list[Path]) -> None:
 def _remove_records(folder: Path) -> None:
     """Remove a folder in which nothing is but what every run leaves as it begins."""
     from fluxvla_core.checkpoints.lock import LOCK
-    from fluxvla_core.config.snapshot import ENVIRONMENT_FILE
+    from fluxvla_core.config.load import ENVIRONMENT_FILE
 
     inside = list(folder.iterdir()) if folder.is_dir() else []
     if {path.name for path in inside} <= {CONFIG_FILE, ENVIRONMENT_FILE, LOCK}:

@@ -25,7 +25,7 @@ from fluxvla_core.cli.plan import Plan, make_plan, refuse_overwriting
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.check import check_config
 from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, UsageError
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 EVALUATION = "eval"
 _OF_A_RANK = ("MASTER_", "TORCHELASTIC_", "GROUP_", "ROLE_")
@@ -103,7 +103,7 @@ class Run:
         after = _plan_evaluation(args, plan) if args.eval_after_train else None
         if args.dry_run:
             from fluxvla_core.cli.dry_run import outline
-            from fluxvla_core.config.hints import whole_options
+            from fluxvla_core.config.overrides import whole_options
 
             text, refused = outline(plan, args.log_format, args.nproc)
             say(text)
@@ -135,8 +135,8 @@ class Run:
                 configured = plan.config.tree[plan.section].get("resume_from")
                 refuse_overwriting(plan.work_dir, asked or configured)
         if plan.trains and _launches(args):
-            from fluxvla_core.cli.choose_reporter import make_reporter
             from fluxvla_core.cli.launch import launch
+            from fluxvla_core.cli.reporters import make_reporter
 
             grace = args.grace or ranks.GRACE_S
             reporter = make_reporter(args.log_format)

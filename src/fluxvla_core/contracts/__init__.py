@@ -4,9 +4,15 @@ from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCh
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.contracts.frame import STATE, Frame, Observation, Sample
 from fluxvla_core.contracts.policy import Actor, Continuation, Policy
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
 from fluxvla_core.contracts.robot import ActionFilter, Clock, Operator, Part
-from fluxvla_core.contracts.runner import Command, Hook, Runner, TrainRunner
+from fluxvla_core.contracts.runner import (
+    Command,
+    Hook,
+    Reporter,
+    Runner,
+    SilentReporter,
+    TrainRunner,
+)
 from fluxvla_core.contracts.training import (
     VLA,
     Collator,

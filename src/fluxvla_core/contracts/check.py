@@ -28,7 +28,7 @@ from fluxvla_core.contracts.runner import TrainRunner
 from fluxvla_core.contracts.training import RandomTransform
 from fluxvla_core.errors import LoadFailed
 from fluxvla_core.registries import BY_NAME, check_api
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Arguments = int | tuple[str, ...] | None
 """What a method is given, without ``self``: so many positional arguments, keywords of these names,

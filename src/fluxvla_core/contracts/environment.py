@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.spec import Camera, EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np

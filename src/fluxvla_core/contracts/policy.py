@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from fluxvla_core.contracts.contract import Contract, attribute, implements, required
 from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.frame import Observation
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np

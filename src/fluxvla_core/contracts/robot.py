@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.errors import NotReady, Rejected
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np

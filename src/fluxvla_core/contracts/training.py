@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract, attribute
 from fluxvla_core.contracts.frame import Sample
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np

@@ -13,7 +13,7 @@ from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import NotReady, OperatorError, Rejected
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 # No command in this time means that no more are under way.

@@ -15,7 +15,7 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Ste
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.plugins.registry import ENVIRONMENTS, POLICIES
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 SIDES = {"left": -1.0, "right": 1.0}
 _STEPS, _STRIDE = 12, 0.1

@@ -21,7 +21,7 @@ import pytest
 
 from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 from fluxvla_core.testing._conformance import Conformance
 
 Array = npt.NDArray[np.float64]

@@ -20,8 +20,7 @@ import pytest
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg, parameters
 from fluxvla_core.evaluation.episodes import DONE, POLICY
-from fluxvla_core.plugins.files import load_plugin_files
-from fluxvla_core.plugins.registry import ENVIRONMENTS
+from fluxvla_core.plugins.registry import ENVIRONMENTS, load_plugin_files
 from fluxvla_core.testing._conformance import Conformance, capability, is_json
 
 Outcomes = Mapping[tuple[str, int], bool]

@@ -23,7 +23,7 @@ from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor, Continuation, with_history
 from fluxvla_core.errors import FluxError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.testing._conformance import Conformance, calling, capability, equal
 
 Chunk = npt.NDArray[np.float64]

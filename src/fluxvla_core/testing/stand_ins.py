@@ -14,7 +14,7 @@ from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.errors import NotReady
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]
 Fault = Callable[[], object]

@@ -26,12 +26,12 @@ from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import ENVIRONMENT, folders
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.checkpoints.writer import Disk
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.sampler import sample_rng
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 from fluxvla_core.training import stop
 from fluxvla_core.training.base_runner import BaseTrainRunner
 from fluxvla_core.training.metrics import WALL_CLOCK

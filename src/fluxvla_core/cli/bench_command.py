@@ -26,7 +26,6 @@ _WIDTH, _COLUMN = 13, 22
 
 
 class BenchPolicy:
-    api = "1.0"
     help = (
         "Measure how long a policy takes from observation to chunk, by stage: that of a "
         "checkpoint, or that of a config with random weights. Observations are random, from --seed."

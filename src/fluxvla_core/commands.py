@@ -1,4 +1,4 @@
-"""Subcommands of the ``fluxvla`` program: what a plugin's own one is written with."""
+"""Public API for a plugin's own subcommands of ``fluxvla``: contract, progress, collection."""
 
 from __future__ import annotations
 

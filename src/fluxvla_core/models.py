@@ -1,5 +1,5 @@
-"""Models and policies: what a model family is written with, how a trained policy is loaded, and how
-checkpoints of other projects are read."""
+"""Public API for models and policies: building a model family, loading a trained policy, reading
+checkpoints of other projects."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Robots: what an operator, an inference runner or an action filter is written with.
+"""Public API for operators, inference runners and action filters.
 
 An operator connects one kind of robot, which an :class:`EmbodimentSpec` describes; a runner drives
 it by a policy. Units are SI; times are seconds on the operator's clock. ``fluxvla_core.ros2`` has
-what operators of ROS 2 robots share.
+the common parts of ROS 2 operators.
 """
 
 from __future__ import annotations

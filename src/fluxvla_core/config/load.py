@@ -18,7 +18,7 @@ from fluxvla_core.untrusted import AT_MOST, read_bytes
 
 BASE = "_base_"
 CONFIG_FILE = "config.resolved.json"
-"""What a run leaves in its work dir, to be run again."""
+"""The resolved config in a run's work dir, which can be run again."""
 FORMAT = "fluxvla-config-1"
 SUFFIXES = (".py", ".toml", ".json")
 DEEPEST = 100
@@ -47,9 +47,9 @@ def load_config(path: str | Path) -> Config:
 
 
 def _load(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Config:
-    """``path``, which the files of ``chain`` inherit; ``loaded`` holds those that were read by now.
+    """Load ``path``, which the files of ``chain`` inherit; ``loaded`` has the files read before.
 
-    Each file is read once: of 25 files that each name the next one twice, the last would else be
+    Each file is read once: if 25 files each name the next one twice, the last would otherwise be
     read 16 million times.
     """
     _check_there(path)
@@ -155,8 +155,8 @@ def _base_path(base: str, child: Path, where: str) -> Path:
 
 
 def _check_size(values: Any, name: str) -> None:
-    """Refuse what is larger than people write: checking it, and listing what is wrong, would take
-    minutes, and recursion over it could end in the middle."""
+    """Refuse a config that is larger than people write: to check it would take minutes, and
+    recursion over it could fail."""
     level, count = [values], 0
     for _ in range(DEEPEST + 1):
         count += sum(len(table) for table in level if isinstance(table, dict))
@@ -219,7 +219,7 @@ def _from_python(text: str, name: str, path: Path) -> Config:
 
 
 def _is_data(name: str, value: Any) -> bool:
-    """Helpers that a config defines for itself (imports, functions, paths) are not keys."""
+    """Whether it is a key: imports, functions and paths of a ``.py`` config are not."""
     if name.startswith("_") or isinstance(value, types.ModuleType):
         return False
     return value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))
@@ -292,7 +292,7 @@ def _from_json(text: str, name: str) -> Config:
     return _finish(tree, {k: v for k, v in origins.items() if k in there}, name)
 
 
-# -- what a run leaves in its work dir -------------------------------------------------------------
+# -- files of a work dir ---------------------------------------------------------------------------
 
 
 def write_resolved(path: Path, config: Config) -> None:
@@ -310,9 +310,9 @@ def write_resolved(path: Path, config: Config) -> None:
 
 
 def environment() -> dict[str, Any]:
-    """Python, the core, every installed plugin and the versions of what they compute with.
+    """Versions of Python, the core, every installed plugin and the main libraries.
 
-    Reads metadata; imports nothing.
+    Read from metadata; nothing is imported.
     """
     import platform
 
@@ -341,7 +341,7 @@ def work_dirs_below(folder: Path, depth: int = 3) -> list[Path]:
                 config = inner / CONFIG_FILE
                 if looked > _LOOKED_AT:
                     break
-                if config.is_file():  # what lies inside is its sections' and checkpoints'
+                if config.is_file():  # folders inside are its sections' and checkpoints'
                     found.append((config.stat().st_mtime, inner))
                 else:
                     below.append(inner)

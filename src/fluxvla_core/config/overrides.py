@@ -98,11 +98,11 @@ def parse_value(text: str) -> Any:
         ) from error
     found: list[tuple[str, str]] = []
     data = plain(value, "", found)
-    return text if found else data  # TOML's dates and times: keep what was typed
+    return text if found else data  # TOML's dates and times stay text
 
 
 def _number(text: str) -> float | int | None:
-    """``text`` as a number if Python reads it as one, else None: a string was hardly meant."""
+    """``text`` as a number if Python reads it as one, else None."""
     try:
         number = float(text)
     except ValueError:
@@ -111,7 +111,7 @@ def _number(text: str) -> float | int | None:
 
 
 def _put(tree: dict[str, Any], key: str, value: Any, add: bool, text: str) -> list[str]:
-    """Set ``key`` in ``tree`` as ``text`` says; returns the keys that now hold what was given."""
+    """Set ``key`` in ``tree``; returns the keys of the new values. ``text`` is for messages."""
     *above, last = split_key(key)
     at: Any = tree
     done = ""
@@ -134,7 +134,7 @@ def _put(tree: dict[str, Any], key: str, value: Any, add: bool, text: str) -> li
 
 
 def _added(old: Any, value: Any, key: str) -> tuple[Any, list[str]]:
-    """``value`` added to what ``key`` holds, and the keys of what is new."""
+    """``value`` added to the value of ``key``, and the keys of the new values."""
     if isinstance(old, list):
         more = value if isinstance(value, list) else [value]
         return [*old, *more], [join_key(key, len(old) + i) for i in range(len(more))]
@@ -188,7 +188,7 @@ def _meant(text: str, key: str) -> str:
 
 
 def _as_set(text: str, key: str, sign: str) -> str:
-    """The override ``text`` for another key, as it is to be typed."""
+    """The override ``text`` for another key, quoted for a shell."""
     match = _SPLIT.search(text)
     assert match is not None  # it was parsed
     return f"--set {shlex.quote(f'{key}{sign}{text[match.end() :]}')}"
@@ -205,7 +205,7 @@ _SECTION = "section"
 
 @contextmanager
 def whole_options(config: Mapping[str, Any], section: str = "") -> Iterator[None]:
-    """Complete the hint of an error of FluxVLA that passes.
+    """Complete the hint of an error that is raised inside.
 
     Args:
         section: the section that runs; its tables go before those of others.
@@ -219,8 +219,11 @@ def whole_options(config: Mapping[str, Any], section: str = "") -> Iterator[None
 
 
 def complete(hint: str, config: Mapping[str, Any], section: str = "") -> str:
-    """``hint`` with the keys of tables; several of one class are listed after it, one with none
-    (its table is in a checkpoint) stays."""
+    """``hint`` with the keys of tables for ``<ClassName>``.
+
+    The keys of several tables of the class are listed after it; with none (the table is in a
+    checkpoint) the hint stays.
+    """
     notes: dict[str, str] = {}
 
     def key(match: re.Match[str]) -> str:
@@ -239,7 +242,7 @@ def complete(hint: str, config: Mapping[str, Any], section: str = "") -> str:
 
 
 def _tables(tree: Any, name: str, key: str) -> Iterator[str]:
-    """Keys of the tables of class ``name``; ``<distribution>:<name>`` is one, too."""
+    """Keys of the tables with ``type`` ``name`` or ``distribution:name``."""
     if isinstance(tree, Mapping):
         if str(tree.get("type")).rpartition(":")[2] == name:
             yield key

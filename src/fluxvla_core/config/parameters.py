@@ -1,4 +1,4 @@
-"""Parameters as source states them: constructors', and the fields of dataclasses."""
+"""Parameters of constructors and fields of dataclasses, from source."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def dataclass_fields(
     """Fields of a dataclass and of the dataclasses that it inherits from, bases first.
 
     Args:
-        counts: which classes have fields; dataclasses by default.
+        counts: whether a class has fields; dataclasses by default.
     """
     found: dict[str, Parameter] = {}
     for base in reversed(order):

@@ -1,12 +1,11 @@
-"""JSON Schema (draft 2020-12) of the configs that what is installed can run.
+"""JSON Schema (draft 2020-12) of configs, for the installed plugins.
 
 For editors: names of sections and keys, ``type`` from the registries, and each class's parameters
-with types, defaults and descriptions. Signatures and docstrings are read as ``config check`` reads
-them, without importing a plugin; the latter finds more, such as what a ``_base_`` leaves undone.
+with types, defaults and descriptions, read without importing a plugin. ``config check`` finds more,
+such as a required key that neither a file nor its ``_base_`` sets.
 
-A file that inherits (``_base_``) writes parts of tables, and so does a variable that is composed
-into others: there, nothing is required. Every definition therefore exists twice, ``whole:…`` and
-``part:…``.
+A file with ``_base_`` has parts of tables, and so has a variable that is composed into others:
+there, nothing is required. Every definition therefore exists twice, ``whole:…`` and ``part:…``.
 """
 
 from __future__ import annotations
@@ -80,7 +79,7 @@ def _ref(*parts: str) -> str:
 
 
 def _classes(registry: str) -> Iterable[_Class]:
-    """Every class of a registry that a config can name; what cannot work is left out."""
+    """Every class of a registry that a config can name, without broken ones."""
     group = BY_NAME[registry]
     registered = [name for name in group if group.registered(name) is not None]
     for name in registered:
@@ -100,7 +99,7 @@ def _classes(registry: str) -> Iterable[_Class]:
 def _installed(plugin: Plugin) -> Found | None:
     try:
         return installed(plugin)
-    except PluginError:  # doctor, and the check of a config that names it, say why
+    except PluginError:  # reported by ``plugins doctor`` and ``config check``
         return None
 
 
@@ -141,7 +140,7 @@ def _section(runners: list[_Class]) -> Schema:
 
 
 def _untyped() -> Schema:
-    """A table whose class is not known here: what its keys hold is known by their names."""
+    """A table of an unknown class: its values are known by the names of their keys."""
     tables = {name: {"$ref": _ref(_PART, registry)} for name, registry in SLOTS.items()}
     return {"properties": tables}
 
@@ -168,7 +167,7 @@ def _loader(kind: str) -> Schema:
 def _slot(kind: str, registry: str, classes: list[_Class]) -> Schema:
     """A value under a key that takes classes of ``registry``: a table, or a list of such.
 
-    A policy may be a word and a metric an object's name: what is neither is left to the class.
+    Other values (a policy may be a word, a metric an object's name) are left to the class.
     """
     names = [one.names[0] for one in classes]
     named: Schema = {
@@ -199,7 +198,7 @@ def _slot(kind: str, registry: str, classes: list[_Class]) -> Schema:
         slot["if"] = {"type": "string"}
         slot["then"] = named
     if kind == _WHOLE and registry not in _MAY_GROUP:
-        # An empty table is what a config writes to be filled in.
+        # An empty table may be filled in by another file.
         slot["if"] = {"type": "object", "minProperties": 1}
         slot["then"] = {"required": ["type"]}
     return slot

@@ -21,12 +21,12 @@ from fluxvla_core.registries import PREFIX, ROWS
 T = TypeVar("T", bound=Callable[..., Any])
 
 PLUGIN_FILE = "fluxvla_plugin_"
-"""What the modules that are made of these files are called, before the name of the file."""
+"""Prefix of the names of the modules that are made from plugin files."""
 _loaded: dict[str, Path] = {}  # module -> its file
 
 
 class Registry:
-    """Names to classes. Installed ones are imported when asked for by name, never before."""
+    """Names to classes. An installed class is imported when it is first requested by name."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -70,8 +70,7 @@ class Registry:
     def get(self, name: str) -> Any:
         """The class called ``name`` (or ``distribution:name``).
 
-        What this process registered comes first: it is the nearer intention. A load failure is
-        remembered and raised again as it was.
+        A class registered in this process comes first. A load failure is kept and raised again.
 
         Raises:
             PluginError: nothing, or more than one, provides the name, or it cannot be loaded.
@@ -105,7 +104,7 @@ class Registry:
         self._here.pop(name, None)
 
     def _check(self, cls: Any, origin: str) -> None:
-        # Who only lists names, or checks a config, needs no contracts.
+        # Not needed to list names or to check a config.
         from fluxvla_core.contracts.check import check_class
 
         check_class(self.name, cls, origin)
@@ -160,11 +159,15 @@ def load_plugin_files(files: Iterable[str | Path]) -> None:
     """Execute each file as a module of its own.
 
     Raises:
-        UsageError: it is not there, or is not a Python file.
+        UsageError: it is missing, or is not a Python file.
         LoadFailed: it raises, or registers a class that breaks a contract.
     """
-    for name in files:
-        _load(Path(name))
+    for path in map(Path, files):
+        if not path.is_file():
+            raise UsageError(f"--plugin {path}: there is no such file")
+        if path.suffix != ".py":
+            raise UsageError(f"--plugin {path}: not a .py file")
+        _execute(path)
 
 
 def plugin_files() -> tuple[str, ...]:
@@ -183,11 +186,7 @@ def forget_plugin_files() -> None:
     _loaded.clear()
 
 
-def _load(path: Path) -> None:
-    if not path.is_file():
-        raise UsageError(f"--plugin {path}: there is no such file")
-    if path.suffix != ".py":
-        raise UsageError(f"--plugin {path}: not a .py file")
+def _execute(path: Path) -> None:
     module = f"{PLUGIN_FILE}{path.stem}".replace("-", "_")
     spec = importlib.util.spec_from_file_location(module, path)
     if spec is None or spec.loader is None:

@@ -1,4 +1,4 @@
-"""A point that is pushed left or right, and who pushes it: for the kit of evaluation runners.
+"""An environment in which a point is pushed left or right, and policies: for EvalRunnerConformance.
 
 Loaded as a plugin file, so that worker processes load it too.
 """
@@ -87,7 +87,7 @@ class _Pusher(Actor):
 
 @POLICIES.register_module()
 class KitListener(_Pusher):
-    """Does what the instruction says, and so succeeds at every task."""
+    """Follows the instruction, and so succeeds at every task."""
 
     def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
         said = observation["task_description"]

@@ -74,7 +74,7 @@ class ActionFilterConformance(Conformance):
         return found
 
     def course(self, filter: ActionFilter) -> Array:
-        """What it makes of ``targets``, from the middle of all limits."""
+        """The filtered ``targets``, from the middle of all limits."""
         filter.reset(self.middle())
         return np.stack([np.array(filter(target.copy()), float) for target in self.targets()])
 

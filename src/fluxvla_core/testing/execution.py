@@ -54,8 +54,8 @@ class ExecutionConformance:
     """
 
     kinds = 8
-    """So many pieces of code may be compiled: kinds of blocks, not blocks. torch gives up on a
-    method that it has compiled eight times."""
+    """The largest number of graphs: kinds of blocks, not blocks. torch gives up on a method that it
+    has compiled eight times."""
 
     @abstractmethod
     def model(self) -> Any:
@@ -168,7 +168,7 @@ def _bare(tensors: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def _forgotten() -> Iterator[None]:
-    """What was compiled before, and what is compiled inside, is forgotten."""
+    """Discard everything that was compiled before, and is compiled inside."""
     torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     try:
@@ -185,7 +185,7 @@ class Refused(AssertionError):
 
 
 class NoWaiting(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Refuses operations that would wait for a GPU, or copy from the host.
+    """Refuses operations that would wait for a GPU or copy from the host.
 
     Raises:
         Refused: naming the operation.
@@ -239,7 +239,7 @@ class Tape:
 
 @contextmanager
 def count_calls(model: torch.nn.Module) -> Iterator[Counter[str]]:
-    """How often each of the model's modules is called inside, by name; those that are."""
+    """Count the calls of the model's modules inside, by name."""
     calls: Counter[str] = Counter()
 
     def note(name: str) -> Callable[..., None]:
@@ -257,7 +257,7 @@ def count_calls(model: torch.nn.Module) -> Iterator[Counter[str]]:
 
 
 def check_capturable(function: Callable[[], Any]) -> Any:
-    """What ``function`` gives, run while nothing may wait for a device.
+    """Run ``function`` while nothing may wait for a device.
 
     Raises:
         Refused: an operation of it would.

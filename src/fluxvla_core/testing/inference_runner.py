@@ -99,7 +99,7 @@ class InferenceRunnerConformance(Conformance):
         return build_runner_from_cfg(self.section(robot, policy, **more), context)
 
     def drive(self, work_dir: Path, robot: Any, policy: Any, **more: Any) -> Any:
-        """What a whole run gives."""
+        """The result of a whole run."""
         runner = self.build(work_dir, robot, policy, **more)
         runner.run_setup()
         return runner.run()

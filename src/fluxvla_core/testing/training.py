@@ -1,4 +1,4 @@
-"""A model, a dataset and a launcher small enough to prove a training strategy with.
+"""A small model, dataset and launcher for tests of training strategies.
 
 ``testing.train_runner`` has the proofs; FluxVLA's own runners are tested with them.
 """
@@ -218,7 +218,7 @@ def tiny_config(
 
 
 class Notes(SilentReporter):
-    """Writes what a run says to people into ``said.txt`` of its work dir."""
+    """Writes the messages of a run into ``said.txt`` of its work dir."""
 
     def __init__(self, work_dir: Path) -> None:
         self.path = work_dir / "said.txt"
@@ -432,8 +432,8 @@ def differences(left: Path, right: Path) -> list[str]:
 def checkpoint_differences(left: Path, right: Path) -> list[str]:
     """Names of files that differ between two checkpoints' folders.
 
-    Not compared are ``environment.json``, for what is installed may change between two runs, and
-    the manifest, which follows from the rest.
+    Not compared are ``environment.json``, as packages may change between two runs, and the
+    manifest, which follows from the rest.
     """
     skipped = {Path(MANIFEST), Path(ENVIRONMENT)}
     files = {p.relative_to(d) for d in (left, right) for p in d.rglob("*") if p.is_file()}

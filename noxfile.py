@@ -189,7 +189,7 @@ def skew(session: nox.Session) -> None:
 
 @nox.session
 def py313(session: nox.Session) -> None:
-    """The tests without torch, on Python 3.13: commands, configs, data, robots, evaluation, kits."""
+    """The tests without torch, on Python 3.13: commands, configs, robots, evaluation, kits."""
     with Steps(session) as step:
         pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
         env = pythons.filled(ROOT, nox.project.dependency_groups(pyproject, "dev"), session.log)

@@ -128,7 +128,7 @@ class EnvironmentConformance(Renamed):
         return {name: value for name, value in record.items() if name != "timing"}
 
     def course(self, environment: Environment, task: TaskSpec, seed: int) -> str:
-        """States, images and rewards of an episode, as text; the same actions for every ``seed``."""
+        """States, images and rewards of an episode as text; actions do not depend on ``seed``."""
         policy = _SameActions()
         settings = RolloutSettings(cameras=self.cameras(environment), max_steps=self.steps)
         record = run_episode(environment, policy, task, seed, settings)

@@ -3,8 +3,8 @@
     python -m fluxvla_core.testing.ros2_driver '{"streams": […], "sinks": […]}'
 
 ``Driver`` starts that process from a test, gives it orders and keeps the messages that it received.
-It is a process of its own because drivers are: lost images, killed publishers and other settings after a
-restart happen between processes only.
+It is a process of its own because drivers are: lost images, killed publishers and other settings
+after a restart happen between processes only.
 Set ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` before starting one.
 """
 
@@ -32,8 +32,8 @@ class Driver:
     """The process, from outside; a context manager.
 
     Args:
-        streams: topics that it publishes. Each has ``topic``, ``message`` (type), ``hz``, and, by type:
-            ``names`` and ``positions`` (JointState), ``height``, ``width`` and ``encoding``
+        streams: topics that it publishes. Each has ``topic``, ``message`` (type), ``hz``, and by
+            type: ``names`` and ``positions`` (JointState), ``height``, ``width`` and ``encoding``
             (Image), ``format`` (CompressedImage: ``jpeg`` or ``png``), ``data`` (std_msgs),
             ``follows`` (a sink's topic: the last command there is where its joints are, in the
             order of ``command_names`` if it has none);

@@ -93,8 +93,8 @@ def _run_section(
         The runner's result, and the signal that asked to stop it when it was done, or 0.
     """
     from fluxvla_core.config.overrides import whole_options
-    from fluxvla_core.contracts import Runner
     from fluxvla_core.contracts.check import is_train_runner
+    from fluxvla_core.contracts.runner import Runner
 
     with whole_options(plan.config.tree, plan.section):
         runner = build(context.config[plan.section], context)
@@ -108,7 +108,7 @@ def _run_section(
 
 def _train(plan: Plan, runner: Any, context: Any) -> tuple[Any, int]:
     from fluxvla_core.build import build_dataset_from_cfg
-    from fluxvla_core.contracts import TrainRunner
+    from fluxvla_core.contracts.runner import TrainRunner
     from fluxvla_core.errors import located
 
     with located(context.where("train_dataloader.dataset")):

@@ -1,7 +1,7 @@
 """``fluxvla``: find the command, run it, turn errors into messages and exit codes.
 
 A command is a class with ``help``, ``add_arguments(parser)`` and ``run(args) -> exit code``
-(``contracts.Command``); a plugin's own (group ``fluxvla.commands``) is the same.
+(``contracts.runner.Command``); a plugin's own (group ``fluxvla.commands``) is the same.
 
 Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
 """

@@ -29,7 +29,6 @@ sys.path.insert(0, str(ROOT))
 from tools import (  # noqa: E402
     envs,
     golden,
-    joined_env,
     lerobot_env,
     needs,
     oracle_env,
@@ -38,7 +37,6 @@ from tools import (  # noqa: E402
     rendering,
     shell,
     skew_check,
-    skipped,
     stages,
     torch_build,
     unseen,
@@ -109,7 +107,7 @@ def tests(session: nox.Session) -> None:
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
         step("next steps named by the demo", lambda: check_next_steps(session))
         step("a third party's plugin in the demo's environment", lambda: check_stranger(session))
-        step("skipped tests", lambda: print(*skipped.summary(SKIPPED), sep="\n"))
+        step("skipped tests", lambda: print(*stages.summary(SKIPPED), sep="\n"))
 
 
 @nox.session
@@ -162,7 +160,7 @@ def oracles(session: nox.Session) -> None:
                 step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT))
         dev = dev_env(session)
         make_renderable(session, dev)
-        both = joined_env.join(env, dev)
+        both = envs.join(env, dev)
         words = ["-m", "pytest", ROOT / "plugins" / "fluxvla-lerobot" / "tests" / "with_lerobot"]
         variables = {**rendering.VARIABLES, **alone}
         step("fluxvla-lerobot", lambda: both.run("python", *words, cwd=ROOT, env=variables))
@@ -251,7 +249,7 @@ def bench(session: nox.Session) -> None:
 
 def run_stage(dev: envs.Env, name: str) -> None:
     """One call of pytest; the first stage lists the files with tests of the other stages."""
-    variables = {**rendering.VARIABLES, skipped.FILE: str(SKIPPED)}
+    variables = {**rendering.VARIABLES, stages.SKIPPED: str(SKIPPED)}
     files: list[str] = []
     if name in MARKS:
         files = stages.files(LATER, MARKS[name])

@@ -106,7 +106,7 @@ def tests(session: nox.Session) -> None:
             step(name, lambda n=name: run_stage(dev, n))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
         step("next steps named by the demo", lambda: check_next_steps(session))
-        step("a third party's plugin in the demo's environment", lambda: check_stranger(session))
+        step("a third party's plugin in the demo's environment", lambda: check_third_party(session))
         step("skipped tests", lambda: print(*stages.summary(SKIPPED), sep="\n"))
 
 
@@ -414,7 +414,7 @@ def check_next_steps(session: nox.Session) -> None:
     next_steps.check(env, ROOT, Path("demo_out"))
 
 
-def check_stranger(session: nox.Session) -> None:
+def check_third_party(session: nox.Session) -> None:
     env, _ = demo_env(session)
     builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
     unseen.check(env, builder, ROOT / ".nox" / "stranger")

@@ -35,7 +35,7 @@ class Env:
         return self.bin / "python"
 
     def variables(self) -> dict[str, str]:
-        """What an activated environment sets, for programs that look for it."""
+        """The variables of an activated environment."""
         path = os.pathsep.join([str(self.bin), os.environ.get("PATH", os.defpath)])
         return {"VIRTUAL_ENV": str(self.root), "PATH": path}
 

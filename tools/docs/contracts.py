@@ -33,7 +33,7 @@ class Page:
     Args:
         name: of its file, without ``.md``.
         title: its heading.
-        about: what stands below it.
+        about: the text below it.
         classes: module below ``fluxvla_core`` -> classes of it; contracts, or data classes.
         only: class -> the methods that are shown of it; all public ones by default.
     """

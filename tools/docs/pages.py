@@ -90,7 +90,7 @@ def shown(path: str, text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """``text`` of a program as Markdown: what is in ``<>`` outside of code is no HTML."""
+    """``text`` as Markdown: ``<>`` outside of code is escaped."""
     return _CODE.sub(lambda found: found["code"] or found[0].replace("<", "&lt;"), text)
 
 

@@ -103,7 +103,7 @@ def build_from_cfg(
     except TypeError as error:
         raise ConfigError(
             f"{cls.__name__}: {error}",
-            where=_section_origin(cfg, context),
+            where=_where(cfg, context),
             next=f"fluxvla plugins show {name}",
         ) from error
     try:
@@ -194,7 +194,7 @@ def _class_of(name: Any, registry: Registry) -> type:
     )
 
 
-def _section_origin(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:
+def _where(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:
     key = _key_of(cfg, context.config) if context is not None else None
     return context.where(key) if context is not None and key else None
 

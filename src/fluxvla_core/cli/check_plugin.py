@@ -49,6 +49,9 @@ class TestPlugin(fluxvla_core.testing.{kit}):
 """
 
 
+_STATES = ("ok", "skipped", "FAILED")
+
+
 class Outcome(NamedTuple):
     """The result of one check: ``ok``, ``skipped`` or ``FAILED``, and its message."""
 
@@ -113,9 +116,6 @@ class CheckPlugin:
         counts = {state: sum(o.state == state for o in found) for state in _STATES}
         say(f"{args.name}: {', '.join(f'{n} {state}' for state, n in counts.items() if n)}")
         return EXIT_FAILED if counts["FAILED"] else EXIT_DONE
-
-
-_STATES = ("ok", "skipped", "FAILED")
 
 
 def _registry_of(name: str) -> str:

@@ -239,6 +239,14 @@ def _quote(text: str | None) -> str:
     return f" in {text.strip()!r}" if text and text.strip() else ""
 
 
+def _unreadable(error: Exception, name: str) -> ConfigError:
+    """The error for text that the parsers of TOML and JSON give up on."""
+    if isinstance(error, RecursionError):
+        return _too_deep(name)
+    # A whole number of thousands of digits.
+    return ConfigError(f"a value cannot be read: {error}", where=name)
+
+
 def _from_toml(text: str, name: str) -> Config:
     import tomli
 
@@ -252,10 +260,8 @@ def _from_toml(text: str, name: str) -> Config:
             f"syntax error: {error.msg} (column {error.colno}){_quote(line[0] if line else None)}",
             where=f"{name}:{error.lineno}",
         ) from error
-    except ValueError as error:  # a whole number of thousands of digits
-        raise ConfigError(f"a value cannot be read: {error}", where=name) from error
-    except RecursionError as error:
-        raise _too_deep(name) from error
+    except (ValueError, RecursionError) as error:
+        raise _unreadable(error, name) from error
     _check_size(values, name)
     return _finish(values, toml_positions(text, name), name)
 
@@ -265,10 +271,8 @@ def _from_json(text: str, name: str) -> Config:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ConfigError(f"syntax error: {error.msg}", where=f"{name}:{error.lineno}") from error
-    except ValueError as error:  # a whole number of thousands of digits
-        raise ConfigError(f"a value cannot be read: {error}", where=name) from error
-    except RecursionError as error:
-        raise _too_deep(name) from error
+    except (ValueError, RecursionError) as error:
+        raise _unreadable(error, name) from error
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else None
         raise ConfigError(

@@ -27,11 +27,12 @@ from fluxvla_core.config.signature import Signature, table_of
 from fluxvla_core.config.source import dotted_name
 from fluxvla_core.config.tree import DELETE
 from fluxvla_core.errors import PluginError
-from fluxvla_core.plugins._metadata import CORE, Plugin, version
+from fluxvla_core.plugins._metadata import CORE, version
 from fluxvla_core.plugins.load import is_core
 from fluxvla_core.plugins.registry import BY_NAME
 from fluxvla_core.registries import BY_NAME as ROWS
 
+Schema = dict[str, Any]
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _WHOLE, _PART = "whole", "part"
 # A table under these may hold others by name instead of being of a class itself.
@@ -60,7 +61,9 @@ def config_schema() -> Schema:
             for one in found:
                 definitions[f"{kind}:{registry}:{one.names[0]}"] = _table(kind, one.found)
     definitions["section"] = _section(classes["runners"])
-    definitions["untyped"] = _untyped()
+    # A table of an unknown class: its values are known by the names of their keys.
+    tables = {name: {"$ref": _ref(_PART, registry)} for name, registry in SLOTS.items()}
+    definitions["untyped"] = {"properties": tables}
     return {
         "$schema": DIALECT,
         "title": "FluxVLA config",
@@ -91,16 +94,11 @@ def _classes(registry: str) -> Iterable[_Class]:
         for plugin in plugins:
             qualified = f"{plugin.dist}:{name}"
             plain = plugin in preferred and name not in registered
-            found_class = _installed(plugin)
-            if found_class is not None:
-                yield _Class((name, qualified) if plain else (qualified,), found_class)
-
-
-def _installed(plugin: Plugin) -> Found | None:
-    try:
-        return installed(plugin)
-    except PluginError:  # reported by ``plugins doctor`` and ``config check``
-        return None
+            try:
+                resolved = installed(plugin)
+            except PluginError:  # reported by ``plugins doctor`` and ``config check``
+                continue
+            yield _Class((name, qualified) if plain else (qualified,), resolved)
 
 
 def _file(kind: str) -> Schema:
@@ -137,12 +135,6 @@ def _section(runners: list[_Class]) -> Schema:
         "then": {"$ref": _ref(_PART, "runners")},
         "else": {"$ref": _ref("untyped")},
     }
-
-
-def _untyped() -> Schema:
-    """A table of an unknown class: its values are known by the names of their keys."""
-    tables = {name: {"$ref": _ref(_PART, registry)} for name, registry in SLOTS.items()}
-    return {"properties": tables}
 
 
 def _loader(kind: str) -> Schema:
@@ -246,8 +238,6 @@ def _parameter(kind: str, parameter: Parameter, meaning: str | None) -> Schema:
         schema["description"] = " ".join(said)
     return schema
 
-
-Schema = dict[str, Any]
 
 _SCALARS = {
     "bool": "boolean",

@@ -20,7 +20,7 @@ graphs:
 - nothing in the function may wait for the device, or depend on a value; nothing in it draws random
   numbers (the noise is an input), so that there is no generator state to register.
 
-What captures and what does not is tested on CPUs by ``fluxvla_core.testing.capture.Tape``, which
+What captures and what does not is tested on CPUs by ``fluxvla_core.testing.execution.Tape``, which
 has the same interface and replays operation by operation.
 """
 

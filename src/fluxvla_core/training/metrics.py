@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from fluxvla_core import atomic
 from fluxvla_core.build import RunContext
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.contracts.training import Metric
 from fluxvla_core.errors import ConfigError, nearest
 

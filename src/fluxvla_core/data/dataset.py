@@ -280,9 +280,9 @@ class ParquetDataset(Dataset):
         sample = self.pipeline(sample, sample_rng(self.seed, key.epoch, key.index))
         # The same for every sample, and with one row a step too much to send from workers.
         sample.pop("stats", None)
-        images = sample.get("images")
-        if isinstance(images, list) and len({image.shape for image in images}) == 1:
-            sample["images"] = join_planes(split_images(images))
+        left = sample.get("images")
+        if isinstance(left, list) and len({image.shape for image in left}) == 1:
+            sample["images"] = join_planes(split_images(left))
         return sample
 
 

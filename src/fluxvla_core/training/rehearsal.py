@@ -6,10 +6,11 @@ What cannot be known is noted; nothing here ends the dry run.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -40,6 +41,7 @@ from fluxvla_core.training.lora import LoraOptions
 from fluxvla_core.training.model import ForwardArguments, Layout, check_observations, trainable
 from fluxvla_core.training.strategy import Strategy
 
+T = TypeVar("T")
 PROCESSES = (1, 2, 4, 8)
 """Numbers of processes to estimate memory for, without ``--nproc``."""
 
@@ -87,15 +89,21 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
         processes: for which numbers of them to count the memory.
     """
     rehearsal = Rehearsal()
-    rehearsal.robot = _robot(context.config, rehearsal.notes)
-    model = _model(context, rehearsal.notes)
-    runner = _runner(context, rehearsal.notes)
+    notes = rehearsal.notes
+    section = context.config.get("inference")
+    operator = section.get("operator") if isinstance(section, Mapping) else None
+    if operator is not None:
+        rehearsal.robot = _tried(notes, "the robot is not known", lambda: _robot(operator))
+    what = "the model cannot be built without memory"
+    model = _tried(notes, what, lambda: on_meta(context))
+    runner = _runner(context, notes)
     if model is not None:
         rehearsal.model = type(model).__name__
         rehearsal.parameters = sum(p.numel() for p in model.parameters())
         rehearsal.action_shape = VLA.adapt(model).action_shape
         if runner is not None and runner.lora is not None:
-            model = _with_adapters(model, runner.lora, context, rehearsal.notes)
+            attach = partial(_with_adapters, model, runner.lora, context)
+            model = _tried(notes, "adapters cannot be put into the model", attach)
     if model is not None:
         rehearsal.trained = sum(p.numel() for p in trainable(model).values())
     batch = _batch(context, rehearsal, runner)
@@ -201,53 +209,35 @@ def _count(
         return
 
 
-@contextmanager
-def _noted(notes: list[str], what: str) -> Iterator[None]:
-    """Context manager: an error inside becomes a note, as the other results are still of use."""
+def _tried(notes: list[str], what: str, make: Callable[[], T]) -> T | None:
+    """``make()``, or None and a note if that fails: the other results are still of use."""
     try:
-        yield
+        return make()
     except Exception as error:  # noqa: BLE001 - classes of plugins, and peft's
         notes.append(f"{what}: {_one_line(error)}")
-
-
-def _robot(config: Mapping[str, Any], notes: list[str]) -> EmbodimentSpec | None:
-    section = config.get("inference")
-    table = section.get("operator") if isinstance(section, Mapping) else None
-    if table is None:
         return None
-    with (
-        _noted(notes, "the robot is not known"),
-        closing(Operator.adapt(build_operator_from_cfg(table))) as operator,
-    ):
+
+
+def _robot(table: Any) -> EmbodimentSpec:
+    with closing(Operator.adapt(build_operator_from_cfg(table))) as operator:
         return operator.embodiment
-    return None
 
 
-def _model(context: RunContext, notes: list[str]) -> nn.Module | None:
-    with _noted(notes, "the model cannot be built without memory"):
-        return on_meta(context)
-    return None
-
-
-def _with_adapters(
-    model: nn.Module, options: LoraOptions, context: RunContext, notes: list[str]
-) -> nn.Module | None:
-    with _noted(notes, "adapters cannot be put into the model"), torch.device("meta"):
+def _with_adapters(model: nn.Module, options: LoraOptions, context: RunContext) -> nn.Module:
+    with torch.device("meta"):
         lora.attach(model, options, context.where(f"{context.section}.lora"))
-        return model
-    return None
+    return model
 
 
 def _runner(context: RunContext, notes: list[str]) -> BaseTrainRunner | None:
     """The section's runner without what it would open: trackers, observers, tokenizers."""
     table = {**context.config[context.section], "metric": None, "tokenizer": None}
     config = {k: v for k, v in context.config.items() if k != "hooks"}
-    config[context.section] = table
-    with _noted(notes, "the runner cannot be built"):
-        runner = build_runner_from_cfg(table, replace(context, config=config))
-        if isinstance(runner, BaseTrainRunner):
-            return runner
-        notes.append(f"{type(runner).__name__} is no BaseTrainRunner: its memory is not known")
+    own = replace(context, config={**config, context.section: table})
+    runner = _tried(notes, "the runner cannot be built", lambda: build_runner_from_cfg(table, own))
+    if runner is None or isinstance(runner, BaseTrainRunner):
+        return runner
+    notes.append(f"{type(runner).__name__} is no BaseTrainRunner: its memory is not known")
     return None
 
 

@@ -153,7 +153,10 @@ class NormalizeStatesAndActions(Transform):
         if self._known is None or self._known[0] is not stats:
             who = type(self).__name__
             state, action = (_entry(stats, key, who) for key in (self.state_key, self.action_key))
-            shared = {"epsilon": self.epsilon, "epsilon_if_zero": self.epsilon_if_zero}
+            shared: dict[str, Any] = {
+                "epsilon": self.epsilon,
+                "epsilon_if_zero": self.epsilon_if_zero,
+            }
             self._known = (
                 stats,
                 make_affine(state, self.state_norm_type, who, self.std_floor, **shared),

@@ -18,7 +18,7 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
-from fluxvla_core.signals import requests_to_stop
+from fluxvla_core.signals import requests_to_stop, signal_name
 
 _STOP_S = 30
 """What torch's agent gives the others when a rank has failed: they have nothing left to save."""
@@ -223,7 +223,7 @@ def _after(prefix: str, said: list[ranks.Failure]) -> str:
 
 def _ending(code: int) -> str:
     if code < 0:
-        return f"killed by {signal.Signals(-code).name}"
+        return f"killed by {signal_name(-code)}"
     return f"exit code {code}"
 
 

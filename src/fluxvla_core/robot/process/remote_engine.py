@@ -36,8 +36,7 @@ from fluxvla_core.robot.process.control_process import (
     ControlProcessGone,
     stop_through_new_connection,
 )
-from fluxvla_core.robot.process.event_messages import event_of
-from fluxvla_core.robot.process.messages import Kind, Message, error_fields, error_of
+from fluxvla_core.robot.process.messages import Kind, Message, error_fields, error_of, event_of
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot

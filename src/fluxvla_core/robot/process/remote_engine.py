@@ -162,9 +162,15 @@ class RemoteEngine(Engine):
             FluxError: its side of the robot cannot be built, or cannot be connected to; or this
                 machine has no room for it.
         """
-        self._started = ControlProcess(
-            self._setup, self._robot, self._interrupts, self._remote_operator
-        )
+        interrupts = self._interrupts
+        # Ctrl-C waits until the process is known here, and can be ended.
+        deferred, interrupts.deferred = interrupts.deferred, True
+        try:
+            self._started = ControlProcess(
+                self._setup, self._robot, interrupts, self._remote_operator
+            )
+        finally:
+            interrupts.deferred = deferred
         try:
             self._await(Kind.READY, _START_S)
             self._order(Kind.CONNECT, None)

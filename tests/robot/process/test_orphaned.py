@@ -7,10 +7,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from fluxvla_core.control.safety import SafetySettings
+from fluxvla_core.robot.process import control_main
 from fluxvla_core.robot.process.inbox import Inbox, MainSilent
 from fluxvla_core.robot.process.link import Link, make_memory
 
@@ -95,6 +97,18 @@ def test_no_control_process_is_left(tmp_path: Path, moment: str) -> None:
     while _runs(int(done.stdout)):
         assert time.monotonic() < deadline, "the control process outlives the main process"
         time.sleep(0.05)
+
+
+def test_a_stop_that_failed_is_reported_once(capfd: pytest.CaptureFixture[str]) -> None:
+    hung = "Arm.stop did not return within 5 s"
+    engine = SimpleNamespace(stop_failure=hung)
+    control_main._report_orphaned(engine, [hung, None])
+    engine.stop_failure = None
+    control_main._report_orphaned(engine, [None, None])
+
+    killed = "fluxvla: the main process was killed; "
+    said = f"{killed}stopping the robot failed: {hung}\n{killed}the robot was stopped\n"
+    assert capfd.readouterr().err == said
 
 
 def _runs(pid: int) -> bool:

@@ -24,7 +24,7 @@ import numpy as np
 
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.control import realtime
-from fluxvla_core.control.interrupt import Interrupted
+from fluxvla_core.control.interrupt import Interrupted, what_became
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.control.safety import Latch
 from fluxvla_core.control.sender import ExecuteActions
@@ -194,12 +194,11 @@ def _outlive_main(inbox: Inbox) -> None:
 
 def _report_orphaned(engine: Engine, failures: Sequence[str | None]) -> None:
     """Print what became of the robot: there is no other process that could."""
-    trouble = "; ".join(text for text in (engine.stop_failure, *failures) if text)
+    # A stop that failed at the episode's end fails again.
+    trouble = "; ".join(dict.fromkeys(text for text in (engine.stop_failure, *failures) if text))
     with suppress(OSError):  # The terminal may be gone, too.
         print(
-            "fluxvla: the main process was killed; the robot was stopped"
-            + (f": {trouble}" if trouble else ""),
-            file=sys.stderr,
+            f"fluxvla: the main process was killed; {what_became(trouble or None)}", file=sys.stderr
         )
 
 

@@ -13,7 +13,7 @@ from fluxvla_core.ros2 import discovery, images, sync
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.streams import CAMERA, DEPTH, STATE, Received, StreamSpec
 from fluxvla_core.ros2.sync import Stale
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 TimedImages = tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]
 # How often a wait for messages that belong together looks again.

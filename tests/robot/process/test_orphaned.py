@@ -22,12 +22,12 @@ import json, os, sys
 from pathlib import Path
 
 from fluxvla_core.control.safety import SafetySettings
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.process.control_process import launch
 from fluxvla_core.robot.process.messages import Kind
 from fluxvla_core.robot.process.setup import ControlSetup
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 folder, moment = Path(sys.argv[1]), sys.argv[2]
 load_plugin_files([str(folder / "plugin.py")])

@@ -18,7 +18,7 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
-from fluxvla_core.signals import requests_to_stop
+from fluxvla_core.signals import requests_to_stop, signal_name
 
 _STOP_S = 30
 """Seconds that torch's agent gives the other ranks to end when one has failed."""

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from fluxvla_core.evaluation.policies import PolicySource as PolicySource
     from fluxvla_core.evaluation.policies import make_policy as make_policy
     from fluxvla_core.evaluation.policies import match_policy as match_policy
+    from fluxvla_core.evaluation.rollout import Diverged as Diverged
     from fluxvla_core.evaluation.rollout import RolloutSettings as RolloutSettings
     from fluxvla_core.evaluation.rollout import run_episode as run_episode
     from fluxvla_core.evaluation.runner import EvalRunner as EvalRunner
-    from fluxvla_core.evaluation.stepping import Diverged as Diverged
 
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
@@ -37,8 +37,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.contracts.policy": ["Actor"],
         "fluxvla_core.evaluation.collect": ["Collection"],
         "fluxvla_core.evaluation.policies": ["PolicySource", "make_policy", "match_policy"],
-        "fluxvla_core.evaluation.rollout": ["RolloutSettings", "run_episode"],
+        "fluxvla_core.evaluation.rollout": ["Diverged", "RolloutSettings", "run_episode"],
         "fluxvla_core.evaluation.runner": ["EvalRunner"],
-        "fluxvla_core.evaluation.stepping": ["Diverged"],
     },
 )

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episodes import DONE
-from fluxvla_core.evaluation.eval_log import FORMAT, FORMER, read_log, whole_lines
+from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, read_log, whole_lines
 from fluxvla_core.evaluation.results_file import all_of, flat
 from fluxvla_core.evaluation.success_rates import mcnemar_test, rate, verdict
 

@@ -16,8 +16,7 @@ from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.config.load import FORMAT as CONFIG_FORMAT
 from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluation.episodes import DONE, reason
-from fluxvla_core.evaluation.eval_log import EvalLog
+from fluxvla_core.evaluation.episodes import DONE, EvalLog, reason
 from fluxvla_core.evaluation.provenance import Code, provenance
 from fluxvla_core.evaluation.success_rates import rate
 

@@ -73,7 +73,7 @@ class Settings:
 
 
 class EpisodeWorker:
-    """Runs episodes in one process: a function from a job to the record of its episode.
+    """Runs episodes in a worker process: a function from a job to the record of its episode.
 
     Environment and policy are made at once, the untrained baseline when it is first needed; all
     are kept.

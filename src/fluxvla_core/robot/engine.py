@@ -50,7 +50,7 @@ class RunHistory:
 
 
 class Engine(ABC):
-    """Base class of what commands a robot in a run, from this process or through another one.
+    """Base class: commands a robot in a run, from this process or through another one.
 
     ``stop_failure`` is what went wrong with the last stop.
     """
@@ -67,7 +67,7 @@ class Engine(ABC):
 
     @abstractmethod
     def commanding(self) -> AbstractContextManager[object]:
-        """Entered while there are episodes."""
+        """A context around all episodes of a run."""
 
     @abstractmethod
     def run_episode(
@@ -108,7 +108,7 @@ class Engine(ABC):
 
     @abstractmethod
     def release(self) -> None:
-        """Hold no more: the robot was stopped."""
+        """End the hold: the robot was stopped."""
 
     @abstractmethod
     def rearm(self) -> None:

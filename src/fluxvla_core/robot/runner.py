@@ -43,9 +43,6 @@ from fluxvla_core.robot.observations import ObservationReader
 from fluxvla_core.robot.options import (
     InferenceOptions,
     build_filters,
-    check_latency,
-    check_state_dim,
-    checked_rate,
     fit_cameras,
 )
 from fluxvla_core.robot.process.remote_engine import RemoteEngine
@@ -105,9 +102,7 @@ class BaseInferenceRunner(Runner):
         self._layout = self._choose_layout(context)
         self.ros_operator, self.robot = self._layout.operator, self._layout.robot
         self.embodiment = self.robot.embodiment
-        self.publish_rate = checked_rate(given.publish_rate, self.robot, self.context)
-        check_state_dim(given.state_dim, self.embodiment, self.context)
-        check_latency(given.simulated_latency, self.robot, self.context)
+        self.publish_rate = given.check_robot(self.robot, self.context)
         self.action_filters = build_filters(
             given.action_filters, given.gripper_threshold, self.embodiment, context
         )
@@ -238,7 +233,7 @@ class BaseInferenceRunner(Runner):
         return result
 
     def episode_facts(self) -> Mapping[str, Any]:
-        """JSON values that the operator tells of the last episode."""
+        """JSON values that the operator reports about the last episode."""
         return self._engine.episode_facts()
 
     @property

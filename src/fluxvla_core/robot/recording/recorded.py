@@ -142,7 +142,7 @@ class Recorded:
 
     @property
     def success(self) -> bool | None:
-        """Whether it was done, where the robot could tell."""
+        """Whether the task was done; None where the robot does not report it."""
         ends = self.of(episode_log.END)
         found = ends[-1].get("success") if ends else None
         return None if found is None else bool(found)

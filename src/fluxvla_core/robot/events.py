@@ -169,7 +169,7 @@ class StoppedWhileHeld(Event):
 
 @dataclass(frozen=True)
 class EpisodeEnded(Event):
-    """The end of an episode; ``problem`` ended it before its time, ``skipped`` ticks were missed."""
+    """The end of an episode; ``problem`` ended it early, ``skipped`` ticks were missed."""
 
     outcome: str
     success: bool | None

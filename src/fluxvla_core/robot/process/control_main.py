@@ -48,7 +48,7 @@ from fluxvla_core.robot.process.remote_policy_client import RemotePolicyClient
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.process.timed_filters import timed_filters
 from fluxvla_core.robot.process.undivided_robot import UndividedRobot
-from fluxvla_core.robot.recording.episode_log import logged
+from fluxvla_core.robot.recording.logged import logged
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.tasks import Task
 

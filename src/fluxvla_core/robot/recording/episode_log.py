@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fluxvla_core.bounds import Finite
 from fluxvla_core.errors import DataError
-from fluxvla_core.robot.events import CommandSent, EpisodeEnded, FilterLeftOut, Stopped
 from fluxvla_core.untrusted import parse_json
 
 
@@ -163,47 +162,3 @@ def summarise(events: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     for event in events:
         summary.add(event)
     return summary.to_dict()
-
-
-def logged(event: CommandSent | FilterLeftOut | Stopped | EpisodeEnded) -> dict[str, Any]:
-    """``event`` as JSON values and arrays."""
-    match event:
-        case CommandSent(at, sent, phase, state, send_s, late_s):
-            seconds = {"send": send_s, "late": late_s}
-            return {
-                "event": COMMAND,
-                "t": at,
-                "phase": phase.value,
-                "wanted": sent.target,
-                "command": sent.command,
-                "state": state,
-                "clamps": [asdict(clamp) for clamp in sent.clamps],
-                **({"held": True} if sent.held else {}),
-                "ms": milliseconds({k: v for k, v in seconds.items() if v is not None}),
-            }
-        case FilterLeftOut(at, name):
-            return {"event": FILTER, "t": at, "filter": name}
-        case Stopped(at, rule, problem, seconds_, failure):
-            return {
-                "event": STOP,
-                "t": at,
-                "rule": rule,
-                "problem": problem,
-                "seconds": seconds_,
-                "failure": failure,
-            }
-        case EpisodeEnded(at, outcome, success, problem, skipped, trips):
-            return {
-                "event": END,
-                "t": at,
-                "outcome": outcome,
-                "success": success,
-                "problem": problem,
-                "skipped_beats": skipped,
-                "trips": [asdict(trip) for trip in trips],
-            }
-
-
-def milliseconds(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Seconds by stage as rounded milliseconds."""
-    return {stage: round(value * 1e3, 3) for stage, value in seconds.items()}

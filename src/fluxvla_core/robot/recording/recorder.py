@@ -31,7 +31,7 @@ from fluxvla_core.robot.events import (
     StoppedWhileHeld,
 )
 from fluxvla_core.robot.recording import episode_log
-from fluxvla_core.robot.recording.episode_log import logged, milliseconds
+from fluxvla_core.robot.recording.logged import logged, milliseconds
 from fluxvla_core.robot.recording.trace import EpisodeTrace, Recording
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.ros2 import RobotFrame, depth_stream

@@ -62,7 +62,7 @@ def read(place: str | Path, group: str = "policy") -> Evaluated:
             cause="it has no episodes.jsonl, nor a folder eval with one",
             next="evaluate first: fluxvla run --config … --section eval --work-dir DIR",
         )
-    if checkpoint is not None and about.get("checkpoint") != _hash(checkpoint):
+    if checkpoint is not None and about.get("checkpoint") != _manifest_hash(checkpoint):
         raise UsageError(
             f"the evaluation in {folder} is of another checkpoint",
             where=str(checkpoint),
@@ -184,7 +184,7 @@ def _logs(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True)
 
 
-def _hash(checkpoint: Path) -> str:
+def _manifest_hash(checkpoint: Path) -> str:
     from fluxvla_core.checkpoints.manifest import NAME, hash_file
 
     return hash_file(checkpoint / NAME)

@@ -335,11 +335,7 @@ def _with_rest(folder: Path, events: list[Event], whole: bool) -> tuple[list[Eve
     rest, complete = read_lines(place)
     last = max((e["t"] for e in events if e["event"] == episode_log.COMMAND), default=-np.inf)
     later = [event for event in rest if event["t"] > last]
-    return sorted([*events, *later], key=_time), complete
-
-
-def _time(event: Event) -> float:
-    return float(event["t"])
+    return sorted([*events, *later], key=lambda event: float(event["t"])), complete
 
 
 def _sorted(

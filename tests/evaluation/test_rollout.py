@@ -14,7 +14,7 @@ from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluation.policies import RandomPolicy, match_policy, resolve_policy
 from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
 from fluxvla_core.evaluation.worker import memory_mb, swapped_task
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 
 @pytest.fixture

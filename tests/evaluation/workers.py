@@ -104,7 +104,7 @@ class Episodes:
 
 def evaluate_forever(folder: str) -> None:
     """What a killed or interrupted evaluation runs: slow episodes into a log."""
-    from fluxvla_core.contracts.reporter import SilentReporter
+    from fluxvla_core.contracts.runner import SilentReporter
     from fluxvla_core.evaluation.episodes import EpisodeKey, EvalLog
     from fluxvla_core.evaluation.pool import WorkerPool
     from fluxvla_core.evaluation.worker import run_in_pool

@@ -25,19 +25,4 @@ if TYPE_CHECKING:
     from fluxvla_core.evaluation.rollout import run_episode as run_episode
     from fluxvla_core.evaluation.runner import EvalRunner as EvalRunner
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.contracts.environment": [
-            "Environment",
-            "EnvironmentSpec",
-            "Step",
-            "TaskSpec",
-        ],
-        "fluxvla_core.contracts.policy": ["Actor"],
-        "fluxvla_core.evaluation.collect": ["Collection"],
-        "fluxvla_core.evaluation.policies": ["PolicySource", "make_policy", "match_policy"],
-        "fluxvla_core.evaluation.rollout": ["Diverged", "RolloutSettings", "run_episode"],
-        "fluxvla_core.evaluation.runner": ["EvalRunner"],
-    },
-)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__)

@@ -29,7 +29,7 @@ from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.control.sender import CommandPipeline, PassThrough
 from fluxvla_core.control.tracking import action_columns, action_values
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 Array = npt.NDArray[np.float64]
 OnStep = Callable[[Environment, int], None]

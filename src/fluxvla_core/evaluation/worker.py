@@ -19,7 +19,7 @@ from typing import Any
 from fluxvla_core.build import build_environment_from_cfg
 from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.policy import Actor
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episodes import (
     DONE,
@@ -36,7 +36,7 @@ from fluxvla_core.evaluation.policy_server import PolicyFacts, ServedPolicy
 from fluxvla_core.evaluation.pool import Outcome, WorkerPool
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.evaluation.videos import VideoRecorder, VideoSettings
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from fluxvla_core.control.clock import Rate, clock_of, in_lockstep
 from fluxvla_core.control.delays import DelayMonitor, robot_call
 from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
-from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
+from fluxvla_core.spec import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
 # How long a safe stop may take before the message says to use the emergency stop.
 STOP_S = 5.0

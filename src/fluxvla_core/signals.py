@@ -12,6 +12,14 @@ from types import FrameType
 Handler = Callable[[int, "FrameType | None"], None]
 
 
+def signal_name(number: int) -> str:
+    """The name of a signal, for example ``SIGKILL``; most real-time signals have only a number."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
 def requests_to_stop() -> list[int]:
     """The signals that ask a process to stop: SIGINT, SIGTERM, and SIGHUP unless it is ignored.
 

@@ -18,7 +18,7 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
-from fluxvla_core.signals import requests_to_stop
+from fluxvla_core.signals import requests_to_stop, signal_name
 
 _STOP_S = 30
 """Seconds that torch's agent gives the other ranks to end when one has failed."""
@@ -190,7 +190,7 @@ def _all(ended: Mapping[int, Any], reported: Mapping[int, ranks.Failure]) -> lis
         late = process.exitcode == -signal.SIGKILL and now - first >= _STOP_S
         terminated = late or process.exitcode == -signal.SIGTERM
         code = process.exitcode
-        ending = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        ending = f"killed by {signal_name(-code)}" if code < 0 else f"exit code {code}"
         text = f"ended without an error message: {ending}"
         if process.exitcode == -signal.SIGKILL:
             text += (

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import time
 import traceback
 from collections import deque
@@ -20,7 +19,7 @@ from fluxvla_core.errors import PluginError
 from fluxvla_core.plugins._metadata import Plugin
 from fluxvla_core.plugins.load import load
 from fluxvla_core.registries import PREFIX
-from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
+from fluxvla_core.signals import held_back, leave_stopping_to_the_parent, signal_name
 
 _AT_ONCE = 2  # importing torch takes a core and half a gigabyte
 
@@ -156,5 +155,5 @@ def _problem(plugin: Plugin, traces: bool) -> str:
 
 def _cause(exitcode: int | None) -> str:
     if exitcode is not None and exitcode < 0:
-        return signal.Signals(-exitcode).name
+        return signal_name(-exitcode)
     return f"exit status {exitcode}"

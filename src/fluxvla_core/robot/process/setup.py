@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -61,6 +62,7 @@ class ControlSetup:
             that the main process is shown. None where it is divided.
         runner: table of a runner that sends commands, or makes observations, by methods of its own:
             it is built here too, without a policy. None where there is none.
+        main: the main process's id.
     """
 
     config: Mapping[str, Any]
@@ -78,6 +80,7 @@ class ControlSetup:
     plugin_files: Sequence[str] = field(default_factory=plugin_files)
     cameras: Sequence[str] | None = None
     runner: Mapping[str, Any] | None = None
+    main: int = field(default_factory=os.getpid)
 
     def to_json(self) -> str:
         """As JSON.

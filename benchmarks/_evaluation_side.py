@@ -26,12 +26,11 @@ HEIGHT, WIDTH = 480, 640
 def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """The evaluation engine: workers, evaluation log, records."""
     from fluxvla_core.contracts.runner import SilentReporter
-    from fluxvla_core.evaluation.episodes import EpisodeKey
-    from fluxvla_core.evaluation.eval_log import open_eval_log
+    from fluxvla_core.evaluation.episodes import EpisodeKey, open_eval_log
     from fluxvla_core.evaluation.policies import PolicySource
     from fluxvla_core.evaluation.pool import WorkerPool
-    from fluxvla_core.evaluation.rollout import RolloutSettings, Settings
-    from fluxvla_core.evaluation.runner import run_in_pool
+    from fluxvla_core.evaluation.rollout import RolloutSettings
+    from fluxvla_core.evaluation.worker import Settings, run_in_pool
     from fluxvla_core.plugins.registry import load_plugin_files
 
     load_plugin_files([__file__])
@@ -65,7 +64,7 @@ class _Worker:
         self.settings = settings
 
     def __call__(self) -> Any:
-        from fluxvla_core.evaluation.rollout import EpisodeWorker
+        from fluxvla_core.evaluation.worker import EpisodeWorker
 
         work, ended = EpisodeWorker(self.settings), time.process_time()
 

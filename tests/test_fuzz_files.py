@@ -36,7 +36,7 @@ from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
 from fluxvla_core.errors import FluxError
 from fluxvla_core.evaluation.compare import Evaluated, compare, describe
 from fluxvla_core.evaluation.compare import read as read_evaluated
-from fluxvla_core.evaluation.eval_log import EvalLog
+from fluxvla_core.evaluation.episodes import EvalLog
 from fluxvla_core.results import open_recording
 from fluxvla_core.training.lora import LoraOptions
 from fluxvla_core.training.state import Progress, SavedOptimizer, SavedTrainer

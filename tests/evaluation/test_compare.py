@@ -10,7 +10,7 @@ import pytest
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import UsageError
 from fluxvla_core.evaluation.compare import compare, describe, read
-from fluxvla_core.evaluation.eval_log import EvalLog
+from fluxvla_core.evaluation.episodes import EvalLog
 
 
 def evaluated(folder, outcomes, group="policy", name="episodes.jsonl", **about):

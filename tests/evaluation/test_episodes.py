@@ -14,11 +14,10 @@ import pytest
 
 from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.errors import RunFailed, UsageError
-from fluxvla_core.evaluation.episodes import EpisodeKey
-from fluxvla_core.evaluation.eval_log import EvalLog, open_eval_log
+from fluxvla_core.evaluation.episodes import EpisodeKey, EvalLog, open_eval_log
 from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.results_file import describe_rate, summarise
-from fluxvla_core.evaluation.runner import run_in_pool
+from fluxvla_core.evaluation.worker import run_in_pool
 from tests.evaluation.workers import Episodes
 
 

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import pytest
 
 from fluxvla_core.evaluation import provenance
-from fluxvla_core.evaluation.eval_log import code_differences
+from fluxvla_core.evaluation.episodes import code_differences
 from fluxvla_core.evaluation.provenance import code_of, commit, rendering
 from fluxvla_core.plugins.registry import load_plugin_files
 

@@ -12,8 +12,8 @@ import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluation.policies import RandomPolicy, match_policy, resolve_policy
-from fluxvla_core.evaluation.rollout import RolloutSettings, memory_mb, run_episode, swapped_task
-from fluxvla_core.evaluation.stepping import Diverged
+from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
+from fluxvla_core.evaluation.worker import memory_mb, swapped_task
 from fluxvla_core.spec import Camera
 
 
@@ -244,7 +244,7 @@ def test_a_wrong_instruction_is_the_next_task_of_those_evaluated(walk):
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux tells it there")
 def test_a_processs_memory_is_its_own_and_not_its_parents():
-    code = "from fluxvla_core.evaluation.rollout import memory_mb; print(memory_mb())"
+    code = "from fluxvla_core.evaluation.worker import memory_mb; print(memory_mb())"
     ballast = np.ones(64_000_000)
     found = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

@@ -105,10 +105,9 @@ class Episodes:
 def evaluate_forever(folder: str) -> None:
     """What a killed or interrupted evaluation runs: slow episodes into a log."""
     from fluxvla_core.contracts.runner import SilentReporter
-    from fluxvla_core.evaluation.episodes import EpisodeKey
-    from fluxvla_core.evaluation.eval_log import EvalLog
+    from fluxvla_core.evaluation.episodes import EpisodeKey, EvalLog
     from fluxvla_core.evaluation.pool import WorkerPool
-    from fluxvla_core.evaluation.runner import run_in_pool
+    from fluxvla_core.evaluation.worker import run_in_pool
 
     keys = [EpisodeKey("policy", "task", seed) for seed in range(40)]
     log = EvalLog(Path(folder) / "episodes.jsonl", {"about": "this"})

@@ -12,7 +12,7 @@ import pytest
 
 from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.control.safety import BadTiming
-from fluxvla_core.robot.observation_history import ObservationHistory
+from fluxvla_core.robot.observations import ObservationHistory
 from fluxvla_core.robot.recording.recorded import open_recording
 
 STRIDE = 5  # control steps of the arm, at 50 Hz, for an action of the policy, at 10 Hz
@@ -150,7 +150,11 @@ def test_what_is_missing_is_waited_for(took):
 
     read = reader_of(clock, took)
     told: list[Any] = []
-    history = ObservationHistory(read, read, robot, policy, 0.5, told.append, sleep)
+    safety = SimpleNamespace(max_age_s=0.5)
+    reader: Any = SimpleNamespace(
+        read=read, sample=read, robot=robot, safety=safety, emit=told.append
+    )
+    history = ObservationHistory(reader, policy, sleep)
 
     def times(seen: Any) -> list[float]:
         return [each["qpos"] for each in (*seen["history"], seen)]

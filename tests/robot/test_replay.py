@@ -11,7 +11,7 @@ from fluxvla_core.build import build_operator_from_cfg, build_policy_from_cfg
 from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.errors import ConfigError, DataError, NotReady, Rejected, SpecMismatch
-from fluxvla_core.robot.inference import FreshnessGate
+from fluxvla_core.robot.observations import FreshnessGate
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.robot.recording.replay import RecordingEnded, ReplayOperator, ReplayPolicy
 from fluxvla_core.ros2 import RobotFrame

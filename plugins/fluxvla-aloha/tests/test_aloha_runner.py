@@ -137,8 +137,7 @@ class Replay:
 def test_an_experts_motion_passes_the_limits_and_does_the_task(tmp_path):
     pytest.importorskip("mujoco")
     operators = pytest.importorskip("fluxvla_sim.operators")
-    from fluxvla_sim.aloha.cube import sample_cube
-    from fluxvla_sim.aloha.expert import Expert
+    from fluxvla_sim.aloha.cube import Expert, sample_cube
 
     operator = operators.AlohaSimOperator(seed=11, height=48, width=64)
     plan = Expert().plan("transfer_cube", sample_cube(11))

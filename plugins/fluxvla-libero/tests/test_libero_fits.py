@@ -30,7 +30,7 @@ from fluxvla_core.evaluation import (
     match_policy,
     rollout,
 )
-from fluxvla_core.evaluation.rollout import EpisodeWorker, Settings
+from fluxvla_core.evaluation.worker import EpisodeWorker, Settings
 from fluxvla_core.operators import Camera, EmbodimentSpec
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fluxvla_metaworld.embodiment import CAMERAS
-from fluxvla_metaworld.environment import MetaWorldEnvironment
+from fluxvla_metaworld.environment import CAMERAS, MetaWorldEnvironment
 from fluxvla_metaworld.expert import MetaWorldExpert
 from fluxvla_metaworld.tasks import INSTRUCTIONS, MT10
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 from fluxvla_sim.aloha.arms import HOME
-from fluxvla_sim.aloha.expert import smooth_noise
+from fluxvla_sim.aloha.cube import smooth_noise
 from fluxvla_sim.collect_command import CollectCommand
 from fluxvla_sim.environment import AlohaSimEnvironment
 from fluxvla_sim.expert import SimExpert

@@ -7,7 +7,7 @@ import pytest
 from fluxvla_sim.environment import AlohaSimEnvironment
 
 from fluxvla_core.evaluation import Diverged
-from fluxvla_core.evaluation.stepping import check_step
+from fluxvla_core.evaluation.rollout import check_step
 from fluxvla_core.testing import EnvironmentConformance
 
 pytest.importorskip("mujoco")

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha.arms import HOME
-from fluxvla_sim.aloha.cube import CUBE_HIGH, CUBE_LOW, MAX_STEPS, AlohaScene, Facts
-from fluxvla_sim.aloha.expert import Expert, arm_ik
+from fluxvla_sim.aloha.cube import CUBE_HIGH, CUBE_LOW, MAX_STEPS, AlohaScene, Expert, Facts, arm_ik
 from fluxvla_sim.aloha.world import ALOHA, CUBE, INSERTION
 from fluxvla_sim.motion import minimum_jerk, quaternion_product, quaternion_share, turn
-from fluxvla_sim.ur.scene import HOME as UR_HOME
-from fluxvla_sim.ur.scene import LiftFacts
-from fluxvla_sim.ur.world import UR5E
+from fluxvla_sim.ur import HOME as UR_HOME
+from fluxvla_sim.ur import UR5E, LiftFacts
 
 TASKS = {task.name: task for task in CUBE.tasks}
 CORNERS = [

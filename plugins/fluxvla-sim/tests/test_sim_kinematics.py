@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fluxvla_aloha.workspace import AlohaWorkspaceBox
 from fluxvla_sim.aloha.cube import AlohaScene
-from fluxvla_sim.ur.scene import URScene
+from fluxvla_sim.ur import URScene
 from fluxvla_ur.embodiment import JOINTS
 from fluxvla_ur.workspace import URWorkspaceBox
 

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from fluxvla_aloha.embodiment import aloha_spec
 from fluxvla_sim.aloha.arms import HOME, load_model
-from fluxvla_sim.aloha.cube import AlohaScene, sample_cube
-from fluxvla_sim.aloha.expert import Expert
+from fluxvla_sim.aloha.cube import AlohaScene, Expert, sample_cube
 from fluxvla_sim.aloha.world import ALOHA
 from fluxvla_sim.operators import AlohaSimOperator, URSimOperator
 from fluxvla_sim.ros2.operators import AlohaSimROSOperator
-from fluxvla_sim.ur.expert import URExpert
+from fluxvla_sim.ur import URExpert
 
 from fluxvla_core.errors import ConfigError, Faulted, NotReady, Rejected
 from fluxvla_core.spec import check_match

@@ -10,7 +10,7 @@ import pytest
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.runner import AlohaInferenceRunner
 from fluxvla_sim.aloha.arms import HOME
-from fluxvla_sim.ur.scene import HOME as UR_HOME
+from fluxvla_sim.ur import HOME as UR_HOME
 from fluxvla_ur.operator import UROperator
 
 from fluxvla_core import BaseInferenceRunner, RunContext

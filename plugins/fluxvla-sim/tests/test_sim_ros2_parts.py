@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from fluxvla_aloha.presets import COBOT_MAGIC, INTERBOTIX
 from fluxvla_sim.aloha.arms import HOME
-from fluxvla_sim.aloha.cube import AlohaScene, sample_cube
-from fluxvla_sim.aloha.expert import Expert
+from fluxvla_sim.aloha.cube import AlohaScene, Expert, sample_cube
 from fluxvla_sim.aloha.world import CUBE
 from fluxvla_sim.ros2.drivers import AlohaDriver, MobileBase, URDriver, command_values
 from fluxvla_sim.ros2.node import Judge, RobotNode

@@ -13,7 +13,7 @@ from fluxvla_sim.aloha.arms import ARM_JOINTS, ARMS, load_model, to_metres, to_n
 from fluxvla_sim.aloha.cube import AlohaScene, Facts
 from fluxvla_sim.aloha.world import ALOHA, CUBE, INSERTION
 from fluxvla_sim.render import Renderer, import_mujoco
-from fluxvla_sim.ur.world import CUBE as LIFT
+from fluxvla_sim.ur import CUBE as LIFT
 from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, task_of
 
 from fluxvla_core.errors import ConfigError, RunFailed

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from fluxvla_core.evaluation.policies import PolicySource as PolicySource
     from fluxvla_core.evaluation.policies import make_policy as make_policy
     from fluxvla_core.evaluation.policies import match_policy as match_policy
+    from fluxvla_core.evaluation.rollout import Diverged as Diverged
     from fluxvla_core.evaluation.rollout import RolloutSettings as RolloutSettings
     from fluxvla_core.evaluation.rollout import run_episode as run_episode
     from fluxvla_core.evaluation.runner import EvalRunner as EvalRunner
-    from fluxvla_core.evaluation.stepping import Diverged as Diverged
 
 __getattr__, __dir__, __all__ = _lazy.attach(__name__)

@@ -26,7 +26,7 @@ from fluxvla_core.control.chunks import not_finite
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
 from fluxvla_core.evaluation.policies import match_policy, resolve_policy
 from fluxvla_core.evaluation.pool import Outcome, WorkerPool
-from fluxvla_core.evaluation.stepping import ChunkCommands, Diverged, check_step, shaped
+from fluxvla_core.evaluation.rollout import ChunkCommands, Diverged, check_step, shaped
 from fluxvla_core.spec import Camera, EmbodimentSpec
 from fluxvla_core.untrusted import read_json
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episodes import DONE
-from fluxvla_core.evaluation.eval_log import FORMAT, FORMER, read_log, whole_lines
+from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, read_log, whole_lines
 from fluxvla_core.evaluation.results_file import all_of, flat
 from fluxvla_core.evaluation.success_rates import mcnemar_test, rate, verdict
 
@@ -63,7 +62,7 @@ def read(place: str | Path, group: str = "policy") -> Evaluated:
             cause="it has no episodes.jsonl, nor a folder eval with one",
             next="evaluate first: fluxvla run --config … --section eval --work-dir DIR",
         )
-    if checkpoint is not None and about.get("checkpoint") != _hash(checkpoint):
+    if checkpoint is not None and about.get("checkpoint") != _manifest_hash(checkpoint):
         raise UsageError(
             f"the evaluation in {folder} is of another checkpoint",
             where=str(checkpoint),
@@ -185,7 +184,7 @@ def _logs(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True)
 
 
-def _hash(checkpoint: Path) -> str:
+def _manifest_hash(checkpoint: Path) -> str:
     from fluxvla_core.checkpoints.manifest import NAME, hash_file
 
     return hash_file(checkpoint / NAME)

@@ -29,7 +29,7 @@ from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.control.clock import MonotonicClock
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.evaluation.stepping import check_step
+from fluxvla_core.evaluation.rollout import check_step
 from fluxvla_core.ros2 import checked_action
 from fluxvla_core.spec import Camera, EmbodimentSpec
 

@@ -120,10 +120,20 @@ def make_policy(source: PolicySource) -> Actor:
 
 
 def load(source: PolicySource) -> LocalPolicy:
-    """The policy of a checkpoint, or its untrained baseline: the same model with fresh random
-    weights and everything else unchanged, which shows what the pipeline does without training."""
+    """The policy of a checkpoint, or its untrained baseline.
+
+    The baseline is the same model with fresh random weights (seed 0) and everything else unchanged;
+    it shows what the pipeline does without training.
+
+    Raises:
+        CheckpointError, ConfigError, PluginError, SpecMismatch: see ``make_policy``.
+    """
+    import torch
+
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
     from fluxvla_core.policies.inference_weights import ready
     from fluxvla_core.policies.loading import load_policy
+    from fluxvla_core.training.weights import model_of
 
     assert source.ckpt_path is not None
     dataset, denormalize = source.dataset, source.denormalize_action
@@ -140,7 +150,9 @@ def load(source: PolicySource) -> LocalPolicy:
         quantization,
     )
     if source.policy == UNTRAINED:
-        model = untrained_model(source.ckpt_path, policy.device)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            model = model_of(Checkpoint.open(source.ckpt_path)).to(policy.device).eval()
         policy.model = ready(model, precision, quantization)
     policy.batch_size = source.batch_size
     return policy
@@ -269,20 +281,3 @@ def policy_tables(path: str) -> list[Any]:
 
     config = Checkpoint.open(path).config()
     return [config.get(name) for name in ("model", "train_dataloader")]
-
-
-def untrained_model(ckpt_path: str, device: str) -> Any:
-    """The checkpoint's model with fresh random weights (seed 0), in evaluation mode.
-
-    Raises:
-        CheckpointError: there is no such checkpoint.
-        ConfigError, PluginError: its model cannot be built here.
-    """
-    import torch
-
-    from fluxvla_core.checkpoints.checkpoint import Checkpoint
-    from fluxvla_core.training.weights import model_of
-
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return model_of(Checkpoint.open(ckpt_path)).to(device).eval()

@@ -15,7 +15,7 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -127,14 +127,8 @@ class PolicyServer:
                 policy = load()
                 check_rows(policy)
                 self._policies[name] = policy
-                self.facts[name] = PolicyFacts(
-                    policy.embodiment,
-                    policy.cameras,
-                    policy.action_rate_hz,
-                    policy.horizon,
-                    policy.continues,
-                    policy.n_obs_steps,
-                )
+                names = [field.name for field in fields(PolicyFacts)]
+                self.facts[name] = PolicyFacts(**{key: getattr(policy, key) for key in names})
         except BaseException as error:  # noqa: BLE001 - it is raised where the server is made
             self._started.put(error)
             return
@@ -225,12 +219,7 @@ class ServedPolicy(Policy):
     n_obs_steps: int
 
     def __init__(self, connection: Connection, name: str, facts: PolicyFacts) -> None:
-        self.embodiment = facts.embodiment
-        self.cameras = facts.cameras
-        self.action_rate_hz = facts.action_rate_hz
-        self.horizon = facts.horizon
-        self.continues = facts.continues
-        self.n_obs_steps = facts.n_obs_steps
+        vars(self).update(vars(facts))
         self._connection = connection
         self._name = name
         self._seed = self._calls = 0

@@ -59,7 +59,8 @@ def code_of(tables: Iterable[Any], simulators: Iterable[str], computes: Iterable
         simulators: distributions that are used in addition to what the plugins require.
         computes: the same, without what these require.
     """
-    names = {name for table in tables for name in _types(table)}
+    types = [table.get("type") for given in tables for table in _tables_in(given)]
+    names = {name.rpartition(":")[2] for name in types if isinstance(name, str)}
     used = [
         plugin
         for (_, name), providers in _metadata.index().plugins.items()
@@ -118,7 +119,9 @@ def unseen_seeds(tables: Any, environment: Any, seeds: Iterable[int]) -> bool | 
     Returns:
         None where a dataset does not say how it was collected.
     """
-    roots = list(_dataset_folders(tables))
+    given = [table.get("data_root_path") for table in _tables_in(tables)]
+    listed = [each if isinstance(each, (list, tuple)) else [each] for each in given]
+    roots = [root for each in listed for root in each if isinstance(root, str)]
     collections = [_collection(Path(root)) for root in roots]
     if not roots or None in collections:
         return None
@@ -130,19 +133,6 @@ def unseen_seeds(tables: Any, environment: Any, seeds: Iterable[int]) -> bool | 
         if any((seed - first) % SPARE_STRIDE < count for seed in seeds):
             return False
     return True
-
-
-def _dataset_folders(table: Any) -> Iterator[str]:
-    """Every ``data_root_path`` below ``table``."""
-    if isinstance(table, Mapping):
-        roots = table.get("data_root_path")
-        for root in roots if isinstance(roots, (list, tuple)) else [roots]:
-            if isinstance(root, str):
-                yield root
-        table = list(table.values())
-    if isinstance(table, (list, tuple)):
-        for value in table:
-            yield from _dataset_folders(value)
 
 
 def _collection(root: Path) -> dict[str, Any] | None:
@@ -166,14 +156,14 @@ def rendering(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _types(table: Any) -> Iterator[str]:
-    if isinstance(table, Mapping):
-        if isinstance(table.get("type"), str):
-            yield table["type"].rpartition(":")[2]
-        table = list(table.values())
-    if isinstance(table, (list, tuple)):
-        for value in table:
-            yield from _types(value)
+def _tables_in(value: Any) -> Iterator[Mapping[str, Any]]:
+    """``value``, if it is a table, and every table below it."""
+    if isinstance(value, Mapping):
+        yield value
+        value = list(value.values())
+    if isinstance(value, (list, tuple)):
+        for each in value:
+            yield from _tables_in(each)
 
 
 def _hash(packages: Iterable[str]) -> str:

@@ -16,8 +16,7 @@ from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.config.load import FORMAT as CONFIG_FORMAT
 from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.evaluation.episodes import DONE, reason
-from fluxvla_core.evaluation.eval_log import EvalLog
+from fluxvla_core.evaluation.episodes import DONE, EvalLog, reason
 from fluxvla_core.evaluation.provenance import Code, provenance
 from fluxvla_core.evaluation.success_rates import rate
 
@@ -69,13 +68,16 @@ def assemble(
 
 
 def save_results(folder: Path, results: Mapping[str, Any], context: RunContext) -> None:
-    """Write ``results.json`` and the config that ran into ``folder``, and report the rates.
+    """Write ``results.json`` and the resolved config into ``folder``, and report the rates.
 
     Raises:
         RunFailed: the disk is full, or the folder was taken away.
     """
     write_results(folder / "results.json", results)
-    keep_config(folder, context)
+    if context.config:  # else the runner was built by hand
+        tree, origins = as_json(context.config), dict(sorted(context.origins.items()))
+        document = {"format": CONFIG_FORMAT, "config": tree, "origins": origins}
+        atomic.write_json(folder / CONFIG_FILE, document)
     context.reporter.artifact("evaluation", folder / "results.json")
     report_results(context.reporter, results, folder)
 
@@ -95,20 +97,6 @@ def write_results(path: Path, results: Mapping[str, Any]) -> None:
             where=str(path),
             next="make room and run the same command again" if full else None,
         ) from error
-
-
-def keep_config(folder: Path, context: RunContext) -> None:
-    """Keep the resolved config next to the results that came of it; each evaluation has its own.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    if not context.config:  # built by hand, not from a config
-        return
-    tree = as_json(context.config)
-    origins = dict(sorted(context.origins.items()))
-    document = {"format": CONFIG_FORMAT, "config": tree, "origins": origins}
-    atomic.write_json(folder / CONFIG_FILE, document)
 
 
 def seeds(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

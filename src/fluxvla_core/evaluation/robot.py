@@ -20,8 +20,7 @@ from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.errors import ConfigError, FluxError, RunFailed
 from fluxvla_core.evaluation import results_file
-from fluxvla_core.evaluation.episodes import DONE, ERROR, EpisodeKey
-from fluxvla_core.evaluation.eval_log import EvalLog, open_eval_log
+from fluxvla_core.evaluation.episodes import DONE, ERROR, EpisodeKey, EvalLog, open_eval_log
 from fluxvla_core.evaluation.policies import chosen_checkpoint, policy_tables
 from fluxvla_core.evaluation.provenance import Code, code_of
 from fluxvla_core.evaluation.videos import choose_episodes, recorded_videos

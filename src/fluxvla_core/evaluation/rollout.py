@@ -1,10 +1,6 @@
-"""Episodes in a worker process: observe, predict, execute some of the chunk, observe again.
+"""One stepped episode: observe, predict, execute some of the chunk, observe again.
 
-A worker makes its environment and its policies once. The result of an episode follows from its key
-alone; then neither the number of workers nor an interruption changes anything but the time it
-takes.
-
-Time stands still while the policy thinks. In an environment whose actions are joint targets the
+Time stands still while the policy computes. In an environment whose actions are joint targets the
 commands are formed by the same path as on a robot: a chunk's actions are joined linearly from the
 last command on and kept within the same limits. Other actions pass the limits unchanged.
 
@@ -15,37 +11,24 @@ action that is executed, as far back as it looks.
 from __future__ import annotations
 
 import hashlib
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from multiprocessing.connection import Connection
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.build import build_environment_from_cfg
 from fluxvla_core.contracts.contract import implements
-from fluxvla_core.contracts.environment import Environment, TaskSpec
+from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor, with_history
-from fluxvla_core.control.chunks import not_finite
-from fluxvla_core.errors import ConfigError
-from fluxvla_core.evaluation.episodes import POLICY, SWAPPED, EpisodeKey
-from fluxvla_core.evaluation.live import LiveSettings, run_live
-from fluxvla_core.evaluation.policies import PolicySource, make_policy, match_policy
-from fluxvla_core.evaluation.policy_server import PolicyFacts, ServedPolicy
-from fluxvla_core.evaluation.stepping import (
-    ChunkCommands,
-    check_state,
-    check_step,
-    history_stride,
-    shaped,
-)
-from fluxvla_core.evaluation.videos import VideoRecorder, VideoSettings
+from fluxvla_core.control.chunks import interpolate, not_finite
+from fluxvla_core.control.limits import CommandLimiter
+from fluxvla_core.control.sender import CommandPipeline, PassThrough
+from fluxvla_core.control.tracking import action_columns, action_values
+from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.spec import Camera
 
 Array = npt.NDArray[np.float64]
@@ -68,133 +51,6 @@ class RolloutSettings:
     replan_every: int | None = None
     max_steps: int | None = None
     policy_seed: int = 0
-
-
-@dataclass(frozen=True)
-class Job:
-    """One episode, and where its video goes; no video by default."""
-
-    key: EpisodeKey
-    video: str | None = None
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the worker processes; every outcome follows from them and the episode's key.
-
-    Args:
-        environment: the table of a registered environment.
-        tasks: names of the tasks that are evaluated; a wrong instruction is of one of them if
-            possible.
-        sources: where the policy of ``policy`` and that of ``untrained`` come from.
-        rollout: how episodes are run; its cameras are filled in for each policy.
-        size: height and width of the policy's images; as it was trained by default.
-        served: attributes of the policies that the parent serves, by group.
-        live: on the wall clock instead of stepped.
-    """
-
-    environment: Mapping[str, Any]
-    tasks: tuple[str, ...]
-    sources: Mapping[str, PolicySource]
-    rollout: RolloutSettings
-    size: tuple[int, int] | None = None
-    video: VideoSettings = field(default_factory=VideoSettings)
-    served: Mapping[str, PolicyFacts] = field(default_factory=dict)
-    live: LiveSettings | None = None
-
-
-class EpisodeWorker:
-    """Runs episodes in one process: a function from a job to the record of its episode.
-
-    Environment and policy are made at once, the untrained baseline when it is first needed; all
-    are kept.
-
-    Args:
-        link: to a ``PolicyServer``, where there are served policies.
-
-    Raises:
-        SpecMismatch: the policy is for another robot, or wants cameras that are not there.
-        FluxError: environment or policy cannot be had.
-    """
-
-    def __init__(self, settings: Settings, link: Connection | None = None) -> None:
-        self._settings = settings
-        self._link = link
-        self.environment = Environment.adapt(build_environment_from_cfg(settings.environment))
-        self._actors: dict[str, tuple[Actor, tuple[Camera, ...]]] = {}
-        # Before the first episode: one that does not fit is refused before a scene is built, and
-        # loading it is not part of an episode's time.
-        self.actor(POLICY)
-
-    def __call__(self, job: Job | EpisodeKey) -> dict[str, Any]:
-        """The record of an episode: JSON values.
-
-        Raises:
-            SpecMismatch: a policy is for another robot, or wants cameras that are not there.
-            FluxError: a policy cannot be loaded, or answers something impossible.
-        """
-        if isinstance(job, EpisodeKey):
-            job = Job(job)
-        settings, key = self._settings, job.key
-        actor, cameras = self.actor(key.group)
-        spec = self.environment.spec
-        if settings.live is not None:
-            return self._live(settings.live, key, actor, cameras)
-        instruction_of = None
-        if key.group == SWAPPED:
-            instruction_of = spec.task(swapped_task(self.environment, key.task, settings.tasks))
-        video = None if job.video is None else VideoRecorder(Path(job.video), settings.video)
-        try:
-            record = run_episode(
-                self.environment,
-                actor,
-                spec.task(key.task),
-                key.seed,
-                replace(settings.rollout, cameras=cameras),
-                instruction_of,
-                video,
-            )
-        finally:
-            if video is not None:
-                video.close()
-        return self._completed(record, cameras)
-
-    def _live(
-        self, live: LiveSettings, key: EpisodeKey, actor: Actor, cameras: tuple[Camera, ...]
-    ) -> dict[str, Any]:
-        task, rollout = self.environment.spec.task(key.task), self._settings.rollout
-        record = run_live(
-            f"{key.group}-{key.task}-{key.seed}",
-            self.environment,
-            actor,
-            task,
-            key.seed,
-            rollout.policy_seed + key.seed,
-            cameras,
-            rollout.max_steps or task.max_steps,
-            live,
-        )
-        return self._completed(record, cameras)
-
-    def _completed(self, record: dict[str, Any], cameras: tuple[Camera, ...]) -> dict[str, Any]:
-        record["timing"]["memory_mb"] = memory_mb()
-        if cameras:
-            sizes = {camera.name: [camera.height, camera.width] for camera in cameras}
-            record["pictures"] = {"sizes": sizes, "by": self.environment.drawn_by()}
-        return record
-
-    def actor(self, group: str) -> tuple[Actor, tuple[Camera, ...]]:
-        """A group's policy and the cameras that it looks at."""
-        name = group if group in self._settings.sources else POLICY
-        if name not in self._actors:
-            actor: Actor
-            if name in self._settings.served and self._link is not None:
-                actor = ServedPolicy(self._link, name, self._settings.served[name])
-            else:
-                actor = make_policy(self._settings.sources[name])
-            cameras = match_policy(actor, self.environment.spec, self._settings.size)
-            self._actors[name] = actor, cameras
-        return self._actors[name]
 
 
 def run_episode(
@@ -311,39 +167,109 @@ def run_episode(
     }
 
 
-def swapped_task(environment: Environment, task: str, evaluated: Sequence[str]) -> str:
-    """The task whose instruction the policy gets instead of that of ``task``.
+class ChunkCommands:
+    """Turns a policy's chunks into commands of an environment, as for a robot.
 
-    It is the next one, cyclically, that could be done in the same scene, and one of ``evaluated``
-    if possible.
+    ``clamped`` counts the commands that were changed by a limit, or that are beyond the limits of
+    an environment that takes no joint targets.
+
+    Args:
+        spec: the environment's description.
+        action_rate_hz: actions a second; the environment's rate by default.
+    """
+
+    def __init__(self, spec: EnvironmentSpec, action_rate_hz: float | None) -> None:
+        self.clamped = 0
+        body = spec.embodiment
+        self._rate = body.rate_hz
+        self._action_rate = action_rate_hz or self._rate
+        self._columns = action_columns(body) if spec.limited else np.arange(0)
+        self._limiter = CommandLimiter(body, 1.0 / self._rate) if spec.limited else None
+        self._pipeline = CommandPipeline(self._limiter or PassThrough(body))
+
+    def start(self, state: Array) -> None:
+        """Begin an episode where the robot is."""
+        self.clamped = 0
+        if self._limiter is not None:
+            self._limiter.start(action_values(self._columns, state))
+
+    def targets(self, chunk: Array) -> Array:
+        """``(N, dim)``, one for each control step; limited only when they are taken."""
+        if self._limiter is None:
+            return chunk
+        return interpolate(self._limiter.last, chunk, self._action_rate, self._rate)
+
+    def command(self, target: Array) -> Array:
+        """The ``(dim,)`` command for one target."""
+        commands, clamps = self._pipeline.form(target[None])
+        self.clamped += bool(clamps[0])
+        return np.asarray(commands[0])
+
+
+def history_stride(actor: Actor, rate_hz: float) -> int:
+    """Control steps between two observations of a policy's history: those of one of its actions.
 
     Raises:
-        ConfigError: the environment's scenes allow no other task.
+        ConfigError: the policy needs a history, and its actions are no whole number of steps.
     """
-    names: list[str] = [each.name for each in environment.spec.tasks]
-    others = list(environment.other_tasks(task))
-    others = [name for name in others if name in evaluated] or others
-    if not others:
+    own = actor.action_rate_hz
+    if actor.n_obs_steps == 1 or own is None:
+        return 1
+    stride = round(rate_hz / own)
+    if stride < 1 or abs(stride * own - rate_hz) > 1e-9 * rate_hz:
         raise ConfigError(
-            f"instruction_swap: no other task of {environment.spec.name} can be done in the scene "
-            f"of {task!r}",
-            next="evaluate without it: --set eval.instruction_swap=false",
+            f"the policy acts on {actor.n_obs_steps} observations (n_obs_steps) 1/{own:g} s apart, "
+            f"the environment takes steps of 1/{rate_hz:g} s: it cannot be observed in between",
+            next="train on data whose frame rate divides the environment's rate",
         )
-    here = names.index(task)
-    return min(others, key=lambda name: (names.index(name) <= here, names.index(name)))
+    return stride
 
 
-def memory_mb() -> float:
-    """The most memory that this process ever had (resident), in MiB; 0 if unknown."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        # Not getrusage: on Linux a new process begins with the peak of the one that started it.
-        lines = status.read_text(encoding="utf-8").splitlines()
-        peaks = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
-        return round(int(peaks[0]) / 1024, 1) if peaks else 0.0
+def shaped(chunk: Any, dim: int) -> Array:
+    """A chunk as ``(T, dim)`` float64, T at least 1.
+
+    Raises:
+        SpecMismatch: it is none; the policy is not for this environment, in any episode.
+    """
     try:
-        import resource
-    except ImportError:  # Windows
-        return 0.0
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(most / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
+        array = np.asarray(chunk, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SpecMismatch(f"the policy's chunk is not an array of numbers: {error}") from error
+    if array.ndim != 2 or array.shape[1] != dim or not len(array):
+        raise SpecMismatch(f"the policy's chunk has shape {array.shape}; (T, {dim}) is needed")
+    return array
+
+
+class Diverged(RunFailed):
+    """A simulation diverged, so the episode's outcome says nothing about the policy."""
+
+
+def check_step(environment: Environment, steps: int) -> Array:
+    """The environment's state after so many steps.
+
+    Raises:
+        Diverged: it is not finite, or the environment's ``divergence()`` says what went wrong.
+    """
+    state = environment.state
+    check_state(state, steps)
+    why = environment.divergence()
+    if why is not None:
+        raise Diverged(
+            f"the simulation diverged in the first {steps} steps: {why}",
+            cause="what happened was too fast for the simulator's time step, as two bodies that "
+            "are pressed into each other; the episode says nothing about the policy",
+        )
+    return state
+
+
+def check_state(state: Any, steps: int) -> None:
+    """Refuse a state that is not finite after so many steps.
+
+    Raises:
+        Diverged: the message says after how many.
+    """
+    if not np.isfinite(state).all():
+        raise Diverged(
+            f"the environment's state is not finite after {steps} steps",
+            cause="the simulation diverged",
+        )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -17,22 +17,20 @@ from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext, bind_options, build_environment_from_cfg
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
-from fluxvla_core.contracts.runner import Reporter, Runner
+from fluxvla_core.contracts.runner import Runner
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import results_file
 from fluxvla_core.evaluation.episodes import (
-    DONE,
-    ERROR,
     POLICY,
     SWAPPED,
     EpisodeKey,
+    EvalLog,
     Shard,
     episode_keys,
-    reason,
+    open_eval_log,
     shard_of,
 )
-from fluxvla_core.evaluation.eval_log import EvalLog, open_eval_log
 from fluxvla_core.evaluation.live import LiveSettings, live_options
 from fluxvla_core.evaluation.options import EvalOptions
 from fluxvla_core.evaluation.policies import (
@@ -44,13 +42,8 @@ from fluxvla_core.evaluation.policies import (
     resolve_policy,
 )
 from fluxvla_core.evaluation.policy_server import PolicyServer
-from fluxvla_core.evaluation.pool import Outcome, WorkerPool
+from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.provenance import Code, code_of, rendering, unseen_seeds
-from fluxvla_core.evaluation.rollout import (
-    EpisodeWorker,
-    Job,
-    Settings,
-)
 from fluxvla_core.evaluation.success_rates import count_behaviours, count_obeyed, instruction_test
 from fluxvla_core.evaluation.videos import (
     VideoSettings,
@@ -59,6 +52,7 @@ from fluxvla_core.evaluation.videos import (
     recorded_videos,
     with_others,
 )
+from fluxvla_core.evaluation.worker import EpisodeWorker, Job, Settings, run_in_pool
 
 FOLDER, LIVE_FOLDER = "eval", "eval_live"
 RECORDS = "episodes"
@@ -336,61 +330,3 @@ class EvalRunner(Runner):
         assert self._spec is not None, "run_setup() comes first"
         assert self._settings is not None
         return self._spec, self._settings
-
-
-def run_in_pool(
-    pool: WorkerPool, keys: Sequence[EpisodeKey], log: EvalLog, reporter: Reporter
-) -> list[dict[str, Any]]:
-    """Run the episodes of ``keys`` that ``log`` does not have yet.
-
-    Args:
-        pool: its factory makes, in a worker process, a function from a key to a result: JSON
-            values with at least ``success`` (bool) and ``steps`` (int).
-
-    Returns:
-        One record for each key, in their order: the result with ``group``, ``task``, ``seed``,
-        ``attempts``, and ``status``, which is ``done``, or ``error`` with the reason in ``error``.
-
-    Raises:
-        RunFailed: workers cannot be started, or results cannot be kept.
-        FluxError: one that means bad input, from a worker.
-        KeyboardInterrupt: after the workers have been ended; finished episodes are kept.
-    """
-    missing = [key for key in keys if key not in log]
-    errors: dict[EpisodeKey, dict[str, Any]] = {}
-    done, began = len(keys) - len(missing), time.monotonic()
-    succeeded = sum(bool(record["success"]) for record in log.records(keys))
-    if done and missing:
-        reporter.info(f"{done} of {len(keys)} episodes are there already; running the others")
-    with closing(pool.run(missing)) as outcomes:
-        for outcome in outcomes:
-            key = missing[outcome.index]
-            record = _record(key, outcome)
-            log.add(record)
-            if record["status"] == ERROR:
-                errors[key] = record
-                reporter.warn(_error_line(record))
-            done += 1
-            succeeded += bool(record.get("success"))
-            reporter.event("episode", **record)
-            pace = 60 * (done - len(keys) + len(missing)) / (time.monotonic() - began)
-            reporter.progress(
-                "episodes", done, len(keys), successes=succeeded, per_minute=round(pace, 1)
-            )
-    return [errors[key] if key in errors else log.records([key])[0] for key in keys]
-
-
-def _record(key: EpisodeKey, outcome: Outcome) -> dict[str, Any]:
-    head = {"group": key.group, "task": key.task, "seed": key.seed}
-    if outcome.error is not None:
-        tail: dict[str, Any] = {"status": ERROR, "error": outcome.error}
-    else:
-        tail = {"status": DONE, **outcome.result}
-    return {**head, **tail, "attempts": outcome.attempts}
-
-
-def _error_line(record: dict[str, Any]) -> str:
-    return (
-        f"episode {record['group']}/{record['task']}/{record['seed']} gave no result "
-        f"after {record['attempts']} attempts: {reason(record['error'])}"
-    )

@@ -19,8 +19,6 @@ from fluxvla_core.spec import Camera
 
 # Tasks whose groups are all shown.
 _COMPARED = 2
-# What results.json says of a video.
-_VIDEO_KEYS = ("group", "task", "seed", "success", "instruction")
 
 
 @dataclass(frozen=True)
@@ -181,10 +179,7 @@ def record_videos(
             made_here.replace(folder / name)
     shutil.rmtree(part, ignore_errors=True)
     return [
-        {
-            **{key: record[key] for key in _VIDEO_KEYS if key in record},
-            "path": f"{folder.name}/{name}",
-        }
+        _video_entry(record, f"{folder.name}/{name}")
         for record, name, there in zip(records, names, made, strict=True)
         if there
     ]
@@ -200,13 +195,16 @@ def recorded_videos(
         folder: of the results, to which the videos' paths are relative.
     """
     return [
-        {
-            **{key: record[key] for key in _VIDEO_KEYS if key in record},
-            "path": Path(os.path.relpath(video, folder)).as_posix(),
-        }
+        _video_entry(record, Path(os.path.relpath(video, folder)).as_posix())
         for record, place in recordings
         for video in sorted(place.glob("*.mp4"))[:1]
     ]
+
+
+def _video_entry(record: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """A video's entry in ``results.json``."""
+    keys = ("group", "task", "seed", "success", "instruction")
+    return {**{key: record[key] for key in keys if key in record}, "path": path}
 
 
 def _in_turn(records: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

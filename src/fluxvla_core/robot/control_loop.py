@@ -42,7 +42,7 @@ _POLL_S = 0.02
 
 
 class EpisodeOver(BaseException):
-    """Ends an episode from inside a tick. Not an error, and nobody's ``except Exception``."""
+    """Raised to end an episode inside a tick; no ``Exception``, so that nobody handles it."""
 
     def __init__(self, outcome: str) -> None:
         self.outcome = outcome
@@ -192,7 +192,7 @@ class ControlLoop:
         return answer, query.last
 
     def _take(self, query: PendingQuery | None) -> PendingQuery | None:
-        """Receive the answer if it is there; else the question is still under way."""
+        """Receive the answer if it is there, else return the query."""
         if query is None or not self._arrived(query):
             return query
         self._receive(self._answer(query), query.last)

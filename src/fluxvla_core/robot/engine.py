@@ -1,21 +1,39 @@
-"""``Engine``: runs episodes on a robot, one after the other, and holds the arm in between."""
+"""A run on a robot: ``Engine`` runs episodes, ``RobotSession`` asks for tasks in between.
+
+Between two episodes the arm holds: its last command is sent again at every tick, because some
+drivers stop an arm when commands cease. The safety rules hold as in an episode. After a stop
+nothing is sent and no task is taken until the task source says ``rearm``.
+"""
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.control import realtime
+from fluxvla_core.control.interrupt import Interrupts
+from fluxvla_core.control.policy_client import PolicyFailed
+from fluxvla_core.control.safety import Latch
+from fluxvla_core.errors import FluxError, NotReady, SafetyStop
 from fluxvla_core.robot.episode import Episode, EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import EpisodeObserver
-from fluxvla_core.robot.tasks import Task
+from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
+
+if TYPE_CHECKING:
+    from fluxvla_core.robot.inference import PolicyThread
+
+_POLL_S = 0.02
+# How long a policy's answer may take that nobody waits for any more.
+_PATIENCE_S = 1.0
+_KEPT = ("task", "outcome", "success", "steps")
 
 
 @dataclass
@@ -32,7 +50,7 @@ class RunHistory:
 
 
 class Engine(ABC):
-    """Base class of what commands a robot in a run, from this process or through another one.
+    """Base class: commands a robot in a run, from this process or through another one.
 
     ``stop_failure`` is what went wrong with the last stop.
     """
@@ -49,7 +67,7 @@ class Engine(ABC):
 
     @abstractmethod
     def commanding(self) -> AbstractContextManager[object]:
-        """Entered while there are episodes."""
+        """A context around all episodes of a run."""
 
     @abstractmethod
     def run_episode(
@@ -90,7 +108,7 @@ class Engine(ABC):
 
     @abstractmethod
     def release(self) -> None:
-        """Hold no more: the robot was stopped."""
+        """End the hold: the robot was stopped."""
 
     @abstractmethod
     def rearm(self) -> None:
@@ -171,3 +189,120 @@ class LocalEngine(Engine):
 
     def close(self) -> str | None:
         return self._parts.robot.close()
+
+
+@dataclass(eq=False)
+class RobotSession:
+    """Asks for tasks, holds the arm meanwhile, and decides whether a stop ends the run.
+
+    Args:
+        source: the opened task source.
+        known: task id -> instruction.
+        free: whether instructions that are not in ``known`` are allowed.
+        engine: commands the robot.
+        latch, interrupts, thread: shared by all episodes of the run.
+    """
+
+    source: TaskSource
+    known: Mapping[str, str]
+    free: bool
+    engine: Engine
+    latch: Latch
+    interrupts: Interrupts
+    thread: PolicyThread
+
+    def __post_init__(self) -> None:
+        self._failure: FluxError | None = None
+        self._count = 0
+        self._last: dict[str, Any] = {}
+
+    def tasks(self) -> Iterator[Task]:
+        """The source's tasks, until it has none left; while it is asked, the arm is held.
+
+        Raises:
+            SafetyStop, NotReady: what ended the hold between two episodes, if nobody can say
+                ``rearm``.
+            Interrupted: a signal came.
+        """
+        return tasks(self.source, self.known, self._idle, self._heard, self.free)
+
+    @contextmanager
+    def episode(self, task: Task) -> Iterator[None]:
+        """Entered while the task's episode runs.
+
+        What stopped the robot is not raised where somebody can say ``rearm``: the run continues
+        without motion.
+        """
+        try:
+            yield
+        except (SafetyStop, PolicyFailed, NotReady) as error:
+            self.source.report(f"{task.name}: failed")
+            self._stopped(error)
+        except BaseException as error:
+            self.source.report(f"{task.name}: failed: {error}")
+            raise
+
+    def ended(self, task: Task, summary: Mapping[str, Any]) -> None:
+        """Called with the summary of an episode that ended well."""
+        if self.source.waits:
+            self.source.announce(_outcome(task, summary))
+        self._count += 1
+        self._last = {key: summary[key] for key in _KEPT}
+
+    def result(self) -> dict[str, Any]:
+        """The last episode's task, outcome, success and steps, and how many there were.
+
+        Raises:
+            SafetyStop: the robot was stopped, and nobody said ``rearm``.
+        """
+        trip = self.latch.tripped
+        if self._failure is not None and trip:
+            # What stopped it was reported then.
+            raise SafetyStop(
+                f"the run ended while the robot was stopped by rule {trip.rule}",
+                next=f"say {REARM!r} before it ends, once the cause is removed",
+            )
+        return {"episodes": self._count, **self._last}
+
+    def _stopped(self, error: FluxError) -> None:
+        """Continue without motion where somebody can say ``rearm``; else raise ``error``."""
+        self.engine.release()
+        # A policy that hangs cannot be asked again.
+        if not self.source.waits or not self.thread.idle_within(_PATIENCE_S):
+            self.source.report(str(error))
+            raise error
+        self._failure = error
+        self.interrupts.resume()
+        self.source.announce(f"{error}\nstopped; {REARM!r} allows motion again")
+
+    def _idle(self) -> None:
+        self.interrupts.deferred = True
+        self.interrupts.check()
+        if not self.engine.holding:
+            time.sleep(_POLL_S)
+            return
+        try:
+            self.engine.hold()
+        except (SafetyStop, NotReady) as error:
+            self._stopped(error)
+
+    def _heard(self, line: str) -> bool:
+        trip = self.latch.tripped
+        if not self.source.waits:
+            self.latch.check()
+        if line.casefold() != REARM:
+            if trip is not None:
+                self.source.announce(
+                    f"still stopped by rule {trip.rule}: {trip.what}\n"
+                    f"look at the robot, remove the cause, then say {REARM!r}"
+                )
+            return trip is not None
+        self.engine.rearm()
+        self.source.announce("nothing was stopped" if trip is None else "motion is allowed again")
+        return True
+
+
+def _outcome(task: Task, summary: Mapping[str, Any]) -> str:
+    """How a task ended, in a line."""
+    verdict = {True: ", success", False: ", no success", None: ""}[summary.get("success")]
+    return f"{task.name}: {summary['outcome']}{verdict}, {summary['steps']} commands"

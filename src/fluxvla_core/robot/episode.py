@@ -126,7 +126,7 @@ class Episode:
 
     Raises:
         RunFailed: an observer cannot take anything, for example write to its folder.
-        BadFrame: the state does not tell where a commanded joint is.
+        BadFrame: the state does not say where a commanded joint is.
     """
 
     def __init__(
@@ -351,7 +351,7 @@ class Episode:
         self._emit(Stopped(now, rule, problem, now - began, failure))
 
     def _state(self) -> Array | None:
-        """The robot's current state; None if it does not tell, or only plays a recording."""
+        """The robot's current state; None if it cannot be read, or only plays a recording."""
         try:
             measured = self._robot.state() if self._robot.follows_commands else None
         except FluxError:

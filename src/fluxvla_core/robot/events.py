@@ -87,7 +87,7 @@ class EpisodePrepared(Event):
 
 @dataclass(frozen=True)
 class EpisodeStarted(Event):
-    """From here on whatever goes wrong stops the robot."""
+    """The episode has begun: from here on whatever goes wrong stops the robot."""
 
     task: Task
 
@@ -101,7 +101,7 @@ class Observed(Event):
 
 @dataclass(frozen=True)
 class Remembered(Event):
-    """A reading between two questions, now that a policy is asked with it as history.
+    """A reading between two queries, now that a query uses it as history.
 
     ``at`` is when it was made, which is before other events that came first.
     """
@@ -169,7 +169,7 @@ class StoppedWhileHeld(Event):
 
 @dataclass(frozen=True)
 class EpisodeEnded(Event):
-    """How it ended. ``problem`` is what ended it before its time; ``skipped`` ticks were missed."""
+    """The end of an episode; ``problem`` ended it early, ``skipped`` ticks were missed."""
 
     outcome: str
     success: bool | None
@@ -179,10 +179,10 @@ class EpisodeEnded(Event):
 
 
 class EpisodeObserver:
-    """Something that is called with every event of an episode."""
+    """Base class of what receives every event of an episode."""
 
     def on_event(self, event: Event) -> None:
-        """Take note of an event; arrays are not to be changed."""
+        """Called with each event; arrays must not be changed."""
 
 
 class HookObserver(EpisodeObserver):

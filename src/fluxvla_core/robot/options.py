@@ -124,60 +124,40 @@ class InferenceOptions:
                 "chunk_joining", f"is {self.chunk_joining!r}, and async_execution is set"
             )
 
+    def check_robot(self, robot: Robot, context: RunContext) -> float:
+        """Refuse values that do not fit the robot; commands a second (``publish_rate``).
+
+        Raises:
+            ConfigError: with the place of its key.
+        """
+        spec, latency = robot.embodiment, self.simulated_latency
+        rate = spec.rate_hz if self.publish_rate is None else float(self.publish_rate)
+        if not 0 < rate <= spec.rate_hz:
+            raise context.error(
+                "publish_rate",
+                f"is {rate:g} Hz; {spec.name} takes up to {spec.rate_hz:g} commands a second",
+            )
+        if robot.lockstep and rate != spec.rate_hz:
+            raise context.error(
+                "publish_rate",
+                f"is {rate:g} Hz, but each command to this simulation lasts 1/{spec.rate_hz:g} s",
+            )
+        if self.state_dim is not None and self.state_dim != spec.state_dim:
+            raise context.error(
+                "state_dim", f"is {self.state_dim}; {spec.name} has {spec.state_dim} state values"
+            )
+        if not 0.0 <= latency < math.inf:
+            raise context.error("simulated_latency", f"must be 0 or more, got {latency}")
+        if latency and not robot.lockstep:
+            raise context.error("simulated_latency", "is for simulations; this robot has its own")
+        return rate
+
     @property
     def joining(self) -> str | Mapping[str, Any]:
         """``chunk_joining``, or its default."""
         if self.chunk_joining is not None:
             return self.chunk_joining
         return "latest_only" if self.async_execution else "synchronous"
-
-
-def checked_rate(publish_rate: float | None, robot: Robot, context: RunContext) -> float:
-    """Commands a second: the config's ``publish_rate``, or the embodiment's rate.
-
-    Raises:
-        ConfigError: the robot does not take commands at this rate.
-    """
-    most = robot.embodiment.rate_hz
-    if publish_rate is None:
-        return most
-    if not 0 < publish_rate <= most:
-        raise context.error(
-            "publish_rate",
-            f"is {publish_rate:g} Hz; {robot.embodiment.name} takes up to "
-            f"{most:g} commands a second",
-        )
-    if robot.lockstep and publish_rate != most:
-        raise context.error(
-            "publish_rate",
-            f"is {publish_rate:g} Hz, but each command to this simulation lasts 1/{most:g} s",
-        )
-    return float(publish_rate)
-
-
-def check_state_dim(state_dim: int | None, embodiment: EmbodimentSpec, context: RunContext) -> None:
-    """Refuse a ``state_dim`` that is not the robot's.
-
-    Raises:
-        ConfigError: it is another one.
-    """
-    if state_dim is not None and state_dim != embodiment.state_dim:
-        raise context.error(
-            "state_dim",
-            f"is {state_dim}; {embodiment.name} has {embodiment.state_dim} state values",
-        )
-
-
-def check_latency(seconds: float, robot: Robot, context: RunContext) -> None:
-    """Refuse a ``simulated_latency`` that no run can have.
-
-    Raises:
-        ConfigError: it is negative or not finite, or the robot's time does not stand still.
-    """
-    if not 0.0 <= seconds < math.inf:
-        raise context.error("simulated_latency", f"must be 0 or more, got {seconds}")
-    if seconds and not robot.lockstep:
-        raise context.error("simulated_latency", "is for simulations; this robot has its own")
 
 
 def fit_cameras(
@@ -224,13 +204,13 @@ def _scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence
         names: the cameras that the policy looks at.
 
     Returns:
-        What is to be said of images that are scaled.
+        Warnings about images that are scaled.
 
     Raises:
         SpecMismatch: a camera's images have another aspect.
     """
     cameras = {camera.name: camera for camera in here.cameras}
-    said = []
+    warnings = []
     for then in trained.cameras:
         now = cameras.get(then.name)
         if then.name not in names or now is None:
@@ -247,8 +227,8 @@ def _scaled_views(trained: EmbodimentSpec, here: EmbodimentSpec, names: Sequence
                 f"{sizes}: another view",
                 next="set the camera to the size, or at least the aspect, of the recordings",
             )
-        said.append(f"{sizes}; they are scaled")
-    return said
+        warnings.append(f"{sizes}; they are scaled")
+    return warnings
 
 
 def build_filters(

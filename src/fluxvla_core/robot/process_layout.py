@@ -62,7 +62,7 @@ class ProcessLayout:
 
     @property
     def notice(self) -> str | None:
-        """What to tell the user about it; None for nothing."""
+        """A message to the user about it; None for nothing."""
         if self.remote_operator is not None:
             return f"{self.robot.name} is not divided: the control process reads its images too"
         if self.why_single_process is None or self.robot.lockstep:

@@ -11,7 +11,7 @@ import math
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,6 @@ from fluxvla_core.control.clock import Rate, clock_of, in_lockstep
 from fluxvla_core.control.delays import DelayMonitor, robot_call
 from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
-from fluxvla_core.robot.operator_values import as_action, as_frame, as_number, as_state
 from fluxvla_core.spec import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
 # How long a safe stop may take before the message says to use the emergency stop.
@@ -179,12 +178,13 @@ class Robot:
         """``(D,)`` the arm's last command, None if nothing, or nothing that still counts.
 
         Args:
-            before: the last command of this run, for operators that do not tell (``last_action``).
+            before: the last command of this run, for operators without ``last_action``.
         """
         if self._has("last_action"):
             last = self._operator.last_action
             name = f"{self.name}.last_action"
-            return None if last is None else as_action(last, self.embodiment, name)
+            names = self.embodiment.joint_names
+            return None if last is None else _as_vector(last, names, self.embodiment.name, name)
         # Who begins episodes may put the arm elsewhere.
         return None if self._has("begin_episode") else before
 
@@ -213,7 +213,7 @@ class Robot:
         return self._has("last_action") or not self.can_stop
 
     def success(self) -> bool | None:
-        """Whether the task is done as of now, where the operator can tell (``task_success``)."""
+        """Whether the task is done as of now (``task_success``); None where that is not known."""
         found = self._operator.task_success()
         return None if found is None else bool(found)
 
@@ -222,7 +222,7 @@ class Robot:
         return self._operator.episode_facts()
 
     def done(self) -> bool:
-        """Whether the episode can end here, where the operator can tell (``task_done``).
+        """Whether the operator says that the episode is over (``task_done``).
 
         Raises:
             BadFrame: it says something else, or raises.
@@ -233,9 +233,9 @@ class Robot:
         return bool(found)
 
     def begin(self, instruction: str, episode: int) -> None:
-        """Tell an operator that wants to know (``begin_episode``) that an episode begins.
+        """Begin an episode (``begin_episode``): simulations put their objects in place.
 
-        Simulations put their objects in place then; ``episode`` counts from 0.
+        ``episode`` counts from 0.
         """
         self._call("begin_episode", self._operator.begin_episode, instruction, episode)
 
@@ -350,3 +350,100 @@ def _check_tighter(config: EmbodimentSpec, operator: EmbodimentSpec) -> None:
                     f"the config's embodiment widens {name} of {config_joint.name} to {value:g}; "
                     f"the robot's own limit is {own_limit:g}"
                 )
+
+
+def as_frame(value: Any, source: str) -> Frame:
+    """``value``, checked to have the fields of a ``Frame``.
+
+    Args:
+        value: what ``source`` gave, for example ``Arm.get_frame()``.
+
+    Raises:
+        BadFrame: it is something else; names ``source``.
+    """
+    fields = ("state", "images", "stamps")
+    if not all(hasattr(value, field) for field in fields):
+        raise BadFrame(
+            f"{source} gave a {type(value).__name__}, not a Frame",
+            cause="a Frame has state, images and stamps; where there is no reading yet, "
+            "get_frame() raises NotReady",
+            next="see docs/writing-a-plugin.md for an example",
+        )
+    for field in fields[1:]:
+        found = getattr(value, field)
+        if not isinstance(found, Mapping):
+            raise BadFrame(f"{field} of what {source} gave is a {type(found).__name__}, not a dict")
+    frame: Frame = value
+    return frame
+
+
+def as_state(value: Any, embodiment: EmbodimentSpec, source: str) -> npt.NDArray[np.float64]:
+    """``value`` as a checked ``(state_dim,)`` float64 array; ``source`` is for the message.
+
+    Raises:
+        BadFrame: it is no array of numbers, has another shape, or is not finite.
+    """
+    return _as_vector(value, embodiment.state_names, embodiment.name, source)
+
+
+def _as_vector(
+    value: Any, names: tuple[str, ...], robot: str, source: str
+) -> npt.NDArray[np.float64]:
+    try:
+        vector = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        vector = np.empty(0, dtype=object)
+    if vector.dtype.kind not in "fiu":
+        raise BadFrame(f"{source} is no array of numbers, but a {type(value).__name__}")
+    if vector.shape != (len(names),):
+        raise BadFrame(f"{source} has shape {vector.shape}; {robot} has ({len(names)},)")
+    bad = [name for name, ok in zip(names, np.isfinite(vector), strict=True) if not ok]
+    if bad:
+        raise BadFrame(f"{source} is not finite for {', '.join(bad)}")
+    return vector.astype(np.float64)
+
+
+def as_number(value: Any, source: str) -> float:
+    """``value`` as a float, checked to be finite; ``source`` is for the message.
+
+    Raises:
+        BadFrame: it is none.
+    """
+    if not is_number(value) or not math.isfinite(value):
+        raise BadFrame(f"{source} is {value!r}, not a finite number")
+    return float(value)
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is a real number, of Python or numpy, and not a bool."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def check_frame(frame: Frame, embodiment: EmbodimentSpec, cameras: Iterable[str]) -> None:
+    """Refuse a frame that is not what the embodiment describes.
+
+    Args:
+        frame: as ``Operator.get_frame`` returns it.
+        embodiment: whose state and cameras are expected.
+        cameras: names of the cameras that are needed.
+
+    Raises:
+        BadFrame: state of another shape or not finite; a camera missing; an image that is not
+            ``(height, width, 3)`` uint8 of the camera's size.
+    """
+    as_state(frame.state, embodiment, "the robot's state")
+    sizes = {camera.name: (camera.height, camera.width, 3) for camera in embodiment.cameras}
+    for name in cameras:
+        image = frame.images.get(name)
+        if image is None:
+            raise BadFrame(
+                f"camera {name} gave no image", cause="it is not connected, or has another name"
+            )
+        if not isinstance(image, np.ndarray):
+            raise BadFrame(f"camera {name} gives a {type(image).__name__}, not an array")
+        if image.dtype != np.uint8 or image.shape != sizes.get(name, image.shape):
+            raise BadFrame(
+                f"camera {name} gives {image.shape} {image.dtype}, "
+                f"the embodiment says {sizes.get(name)} uint8",
+                cause="the camera's mode was changed, or the spec is of another camera",
+            )

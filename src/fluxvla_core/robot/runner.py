@@ -35,20 +35,16 @@ from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.hooks import build_hooks
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
+from fluxvla_core.robot.engine import Engine, LocalEngine, RobotSession, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import Event, HookObserver
-from fluxvla_core.robot.inference import LocalPolicyClient, ObservationReader
-from fluxvla_core.robot.observation_history import ObservationHistory
+from fluxvla_core.robot.inference import LocalPolicyClient, PolicyThread
+from fluxvla_core.robot.observations import ObservationReader
 from fluxvla_core.robot.options import (
     InferenceOptions,
     build_filters,
-    check_latency,
-    check_state_dim,
-    checked_rate,
     fit_cameras,
 )
-from fluxvla_core.robot.policy_thread import PolicyThread
 from fluxvla_core.robot.process.remote_engine import RemoteEngine
 from fluxvla_core.robot.process.setup import ControlSetup, registered_here
 from fluxvla_core.robot.process_layout import (
@@ -61,7 +57,6 @@ from fluxvla_core.robot.recording.recorder import EpisodeRecorder
 from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.robot.session import RobotSession
 from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
 
 Array = npt.NDArray[np.float64]
@@ -107,9 +102,7 @@ class BaseInferenceRunner(Runner):
         self._layout = self._choose_layout(context)
         self.ros_operator, self.robot = self._layout.operator, self._layout.robot
         self.embodiment = self.robot.embodiment
-        self.publish_rate = checked_rate(given.publish_rate, self.robot, self.context)
-        check_state_dim(given.state_dim, self.embodiment, self.context)
-        check_latency(given.simulated_latency, self.robot, self.context)
+        self.publish_rate = given.check_robot(self.robot, self.context)
         self.action_filters = build_filters(
             given.action_filters, given.gripper_threshold, self.embodiment, context
         )
@@ -240,7 +233,7 @@ class BaseInferenceRunner(Runner):
         return result
 
     def episode_facts(self) -> Mapping[str, Any]:
-        """JSON values that the operator tells of the last episode."""
+        """JSON values that the operator reports about the last episode."""
         return self._engine.episode_facts()
 
     @property
@@ -322,14 +315,9 @@ class BaseInferenceRunner(Runner):
         ) -> LocalPolicyClient:
             reader = ObservationReader(
                 robot, observe, task.instruction, self._cameras, self.safety,
-                self.options.ready_timeout, tracking, thread, interrupts, emit,
+                self.options.ready_timeout, tracking, thread.submit, interrupts, emit,
             )  # fmt: skip
-            seen = ObservationHistory(
-                reader.read, reader.sample, robot, self.policy, self.safety.max_age_s, emit
-            )
-            return LocalPolicyClient(
-                robot, reader, seen, self.policy, seed, thread, self.safety, emit
-            )
+            return LocalPolicyClient(reader, self.policy, seed, thread)
 
         settings, tables = self._episode_settings(), layout.tables
         if tables is None:

@@ -170,7 +170,7 @@ class TaskSource(ABC):
         return
 
     def announce(self, text: str) -> None:
-        """Tell the person or program that gives the tasks."""
+        """Show a message to the person or program that gives the tasks."""
         return
 
     def report(self, text: str) -> None:

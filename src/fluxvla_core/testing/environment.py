@@ -24,8 +24,7 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Ste
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.errors import FluxError
 from fluxvla_core.evaluation.policies import RandomPolicy
-from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
-from fluxvla_core.evaluation.stepping import Diverged
+from fluxvla_core.evaluation.rollout import Diverged, RolloutSettings, run_episode
 from fluxvla_core.plugins.registry import ENVIRONMENTS, POLICIES
 from fluxvla_core.spec import Camera
 from fluxvla_core.testing._conformance import Renamed, is_json, unequal_keys

@@ -12,7 +12,7 @@ import numpy as np
 from fluxvla_sim.aloha.world import CUBE as TWO_ARMS
 from fluxvla_sim.ros2.node import simulate
 from fluxvla_sim.ros2.settings import NodeSettings
-from fluxvla_sim.ur.world import CUBE as ONE_ARM
+from fluxvla_sim.ur import CUBE as ONE_ARM
 
 from fluxvla_core.commands import make_reporter
 from fluxvla_core.ros2 import FLOAT64, JOINT_STATE, BadMessage, joints, message_class

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import Policy
-from fluxvla_metaworld.embodiment import CONTROL_HZ, metaworld_spec
-from fluxvla_metaworld.environment import MetaWorldEnvironment
+from fluxvla_metaworld.environment import CONTROL_HZ, MetaWorldEnvironment, metaworld_spec
 
 if TYPE_CHECKING:
     from fluxvla_core.models import Observation

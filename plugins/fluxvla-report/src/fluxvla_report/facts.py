@@ -88,7 +88,7 @@ class Evaluation:
     plain values that the results state with the rates. ``obeyed`` is how often a group did the
     task of its instruction, whatever the scene's own task is. ``live``: the simulation ran on the
     wall clock and did not wait for the policy. ``unseen``: the seeds of the training are known and
-    none of them was evaluated. ``made``: when it ran, of which commit, with which versions.
+    none of them was evaluated. ``made``: when it ran, its commit and versions.
     """
 
     name: str

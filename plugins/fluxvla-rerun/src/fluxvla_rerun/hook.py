@@ -1,4 +1,4 @@
-"""The hook: what a run tells of itself, as entities of a Rerun recording."""
+"""``RerunViewer``: a hook that logs a run's data to a Rerun recording."""
 
 from __future__ import annotations
 

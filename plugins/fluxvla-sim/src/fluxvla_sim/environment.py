@@ -13,7 +13,7 @@ from fluxvla_mujoco import MujocoEnvironment, check_render
 from fluxvla_core.evaluation import EnvironmentSpec, Step, TaskSpec
 from fluxvla_core.operators import Camera
 from fluxvla_sim.aloha.world import ALOHA
-from fluxvla_sim.ur.world import UR5E
+from fluxvla_sim.ur import UR5E
 from fluxvla_sim.world import Scene, SimRobot, SimWorld
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import EvalRunner
 from fluxvla_sim.aloha.world import ALOHA
-from fluxvla_sim.ur.world import UR5E
+from fluxvla_sim.ur import UR5E
 from fluxvla_sim.world import SimRobot
 
 

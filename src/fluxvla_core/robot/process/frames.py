@@ -22,8 +22,8 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import STATE, Frame, RobotFrame
 from fluxvla_core.control.safety import BadFrame
-from fluxvla_core.robot.operator_values import is_number
 from fluxvla_core.robot.process.link import allocate
+from fluxvla_core.robot.robot import is_number
 from fluxvla_core.spec import EmbodimentSpec
 
 AnyArray = npt.NDArray[Any]

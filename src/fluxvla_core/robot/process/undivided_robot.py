@@ -12,7 +12,6 @@ from typing import Any
 from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.control.safety import BadFrame, BadTiming
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.operator_values import as_state, check_frame, is_number
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
     FrameMessage,
@@ -21,7 +20,7 @@ from fluxvla_core.robot.process.frames import (
     message_of_observation,
 )
 from fluxvla_core.robot.process.messages import error_fields
-from fluxvla_core.robot.robot import Observe, Robot, StateSample
+from fluxvla_core.robot.robot import Observe, Robot, StateSample, as_state, check_frame, is_number
 from fluxvla_core.spec import EmbodimentSpec
 
 

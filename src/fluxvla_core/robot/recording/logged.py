@@ -1,4 +1,8 @@
-"""Events of the side that commands a robot, as a record has them."""
+"""Events of the process that commands a robot, in the format of an episode's log.
+
+Apart from ``episode_log``, which readers of logs import without the engine; and from the recorder,
+whose files and images the control process has no use for.
+"""
 
 from __future__ import annotations
 

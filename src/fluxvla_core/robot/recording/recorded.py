@@ -142,7 +142,7 @@ class Recorded:
 
     @property
     def success(self) -> bool | None:
-        """Whether it was done, where the robot could tell."""
+        """Whether the task was done; None where the robot does not report it."""
         ends = self.of(episode_log.END)
         found = ends[-1].get("success") if ends else None
         return None if found is None else bool(found)
@@ -335,11 +335,7 @@ def _with_rest(folder: Path, events: list[Event], whole: bool) -> tuple[list[Eve
     rest, complete = read_lines(place)
     last = max((e["t"] for e in events if e["event"] == episode_log.COMMAND), default=-np.inf)
     later = [event for event in rest if event["t"] > last]
-    return sorted([*events, *later], key=_time), complete
-
-
-def _time(event: Event) -> float:
-    return float(event["t"])
+    return sorted([*events, *later], key=lambda event: float(event["t"])), complete
 
 
 def _sorted(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from fluxvla_core.robot.robot import Robot
 from fluxvla_core.ros2 import RobotFrame, depth_stream
 
 
+@dataclass(eq=False)
 class EpisodeRecorder(EpisodeObserver):
     """Writes events, images and videos of an episode into a folder.
 
@@ -52,24 +53,16 @@ class EpisodeRecorder(EpisodeObserver):
     ``summary`` is what ``episode.json`` holds, once the episode has ended.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        robot: Robot,
-        policy: Policy,
-        cameras: tuple[str, ...],
-        video_fps: float | None,
-        everything: bool,
-        reporter: Reporter,
-    ) -> None:
+    folder: Path
+    robot: Robot
+    policy: Policy
+    cameras: tuple[str, ...]
+    video_fps: float | None
+    everything: bool
+    reporter: Reporter
+
+    def __post_init__(self) -> None:
         self.summary: dict[str, Any] = {}
-        self.folder = folder
-        self._robot = robot
-        self._policy = policy
-        self._cameras = cameras
-        self._video_fps = video_fps
-        self._everything = everything
-        self._reporter = reporter
         self._counted = episode_log.EpisodeSummary()
         self._commands = 0
         self._rate_hz = 0.0
@@ -94,7 +87,7 @@ class EpisodeRecorder(EpisodeObserver):
                     episode_log.CHUNK,
                     event.at,
                     observed=event.reading.at,
-                    rate_hz=self._policy.action_rate_hz,
+                    rate_hz=self.policy.action_rate_hz,
                     keyframes=event.actions,
                     ms=milliseconds(event.stages),
                 )
@@ -115,13 +108,13 @@ class EpisodeRecorder(EpisodeObserver):
         Raises:
             RunFailed: the folder cannot be written to.
         """
-        robot, policy = self._robot, self._policy
+        robot, policy = self.robot, self.policy
         spec = robot.embodiment
         self._rate_hz = event.rate_hz
         source = robot.images_after
         names = {"state": spec.state_names, "action": spec.joint_names}
-        recording = Recording(names, spec.camera_names, source) if self._everything else None
-        self._trace = EpisodeTrace(self.folder, self._video_fps, recording)
+        recording = Recording(names, spec.camera_names, source) if self.everything else None
+        self._trace = EpisodeTrace(self.folder, self.video_fps, recording)
         self._write(
             episode_log.START,
             event.at,
@@ -172,7 +165,7 @@ class EpisodeRecorder(EpisodeObserver):
             dropped = self._trace.dropped.items()
             lost = [f"{count} {words.get(what, what)}" for what, count in dropped if count]
             if lost:
-                self._reporter.warn(
+                self.reporter.warn(
                     f"{' and '.join(lost)} were not recorded: "
                     "the disk or the processor did not keep up"
                 )
@@ -180,8 +173,8 @@ class EpisodeRecorder(EpisodeObserver):
             if event.problem is None:
                 raise
             # A lost record must not hide why an episode ended.
-            self._reporter.warn(str(error))
-        self._reporter.artifact("episode", self.folder)
+            self.reporter.warn(str(error))
+        self.reporter.artifact("episode", self.folder)
 
     def _note_stop(self, event: StoppedWhileHeld) -> None:
         place = self.folder / episode_log.HELD
@@ -191,7 +184,7 @@ class EpisodeRecorder(EpisodeObserver):
                 file.write(json.dumps(fields) + "\n")
         except OSError as error:
             problem = RunFailed(f"a trip could not be recorded: {error}", where=str(place))
-            self._reporter.warn(str(problem))
+            self.reporter.warn(str(problem))
 
     def _write(self, kind: str, at: float, **fields: Any) -> None:
         self._keep({"event": kind, "t": at, **fields})
@@ -209,7 +202,7 @@ class EpisodeRecorder(EpisodeObserver):
 
     def _film(self) -> None:
         """A frame for each video: fresh from a simulation, else the last one that was seen."""
-        robot, fps = self._robot, self._video_fps
+        robot, fps = self.robot, self.video_fps
         if fps is None or self._commands % max(1, round(self._rate_hz / fps)):
             return
         images: Mapping[str, Any] = self._images
@@ -219,7 +212,7 @@ class EpisodeRecorder(EpisodeObserver):
             images = frame.images
             for camera, image in images.items():
                 self._trace.image(camera, frame.stamps[camera], image)
-        shown = self._cameras or images
+        shown = self.cameras or images
         self._trace.frames({name: images[name] for name in shown if name in images})
 
 

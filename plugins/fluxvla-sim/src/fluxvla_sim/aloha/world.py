@@ -7,10 +7,22 @@ from typing import TYPE_CHECKING
 
 from fluxvla_aloha.embodiment import aloha_spec
 
-from fluxvla_sim.aloha.cube import MAX_STEPS, AlohaScene, Facts, LiftHold, TransferCube
-from fluxvla_sim.aloha.expert import Expert, smooth_noise
-from fluxvla_sim.aloha.insertion import Insertion, InsertionFacts, InsertionScene
-from fluxvla_sim.aloha.insertion_expert import InsertionExpert, insertion_noise
+from fluxvla_sim.aloha.cube import (
+    MAX_STEPS,
+    AlohaScene,
+    Expert,
+    Facts,
+    LiftHold,
+    TransferCube,
+    smooth_noise,
+)
+from fluxvla_sim.aloha.insertion import (
+    Insertion,
+    InsertionExpert,
+    InsertionFacts,
+    InsertionScene,
+    insertion_noise,
+)
 from fluxvla_sim.world import CONTROL_HZ, SimRobot, SimWorld
 
 if TYPE_CHECKING:

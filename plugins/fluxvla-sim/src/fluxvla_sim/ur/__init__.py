@@ -1,1 +1,0 @@
-"""A UR5e with a Robotiq 2F-85 at a table with one cube."""

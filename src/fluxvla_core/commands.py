@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from fluxvla_core import _lazy
 
 if TYPE_CHECKING:
+    from fluxvla_core.cli.choose_reporter import make_reporter as make_reporter
     from fluxvla_core.cli.data_commands import collect_demonstrations as collect_demonstrations
     from fluxvla_core.cli.reporters import heartbeat as heartbeat
-    from fluxvla_core.cli.reporters import make_reporter as make_reporter
     from fluxvla_core.contracts.runner import Command as Command
     from fluxvla_core.contracts.runner import Reporter as Reporter
     from fluxvla_core.contracts.runner import SilentReporter as SilentReporter

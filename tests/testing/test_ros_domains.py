@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from fluxvla_core.testing import ros_domains
+from fluxvla_core.testing import ros2
 from fluxvla_core.testing.ros2 import DOMAINS, claimed_domain
 
 CLAIM = """
@@ -38,7 +38,7 @@ def test_other_processes_count_until_they_end_however_they_do(tmp_path, monkeypa
         text=True,
     )
     theirs = int(other.stdout.readline())
-    monkeypatch.setattr(ros_domains, "DOMAINS", range(theirs, theirs + 1))
+    monkeypatch.setattr(ros2, "DOMAINS", range(theirs, theirs + 1))
     with pytest.raises(RuntimeError, match="all 1 ROS domains are taken; their locks are in"):
         claimed_domain(tmp_path).__enter__()
     other.kill()
@@ -51,7 +51,7 @@ def test_other_processes_count_until_they_end_however_they_do(tmp_path, monkeypa
 def test_a_domain_that_a_robot_is_on_is_passed_over(tmp_path, monkeypatch):
     with claimed_domain(tmp_path) as domain:
         port = 7400 + 250 * domain + 10
-    monkeypatch.setattr(ros_domains, "DOMAINS", range(domain, domain + 1))
+    monkeypatch.setattr(ros2, "DOMAINS", range(domain, domain + 1))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
         robot.bind(("", port))
         with pytest.raises(RuntimeError, match="are taken"):

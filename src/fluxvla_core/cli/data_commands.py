@@ -166,7 +166,8 @@ def _add_dataset(parser: Parser) -> None:
 def _reporter(
     log_format: str, stream: TextIO | None = None, heartbeat: bool = False
 ) -> Iterator[RunReporter]:
-    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
+    from fluxvla_core.cli.choose_reporter import make_reporter
+    from fluxvla_core.cli.reporters import KeepAliveReporter
 
     made = make_reporter(log_format, stream)
     reporter = KeepAliveReporter(made) if heartbeat else made

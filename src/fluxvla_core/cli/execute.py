@@ -26,7 +26,8 @@ def execute(plan: Plan, args: argparse.Namespace) -> int:
         The signal that asked to stop it when it was done, or 0.
     """
     from fluxvla_core.build import RunContext, build_runner_from_cfg
-    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
+    from fluxvla_core.cli.choose_reporter import make_reporter
+    from fluxvla_core.cli.reporters import KeepAliveReporter
     from fluxvla_core.config.tree import freeze
     from fluxvla_core.contracts.runner import SilentReporter
 

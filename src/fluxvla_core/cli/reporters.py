@@ -118,19 +118,6 @@ def heartbeat(what: str, every: float = EVERY_S) -> Iterator[None]:
         reporter.close()
 
 
-def make_reporter(log_format: str, stream: TextIO | None = None) -> RunReporter:
-    """The reporter for ``--log-format``: ``json``, or ``text`` (bars where ``stream`` has a
-    terminal behind it)."""
-    out = sys.stdout if stream is None else stream
-    if log_format == "json":
-        return JsonReporter(out)
-    if out.isatty():
-        from fluxvla_core.cli.rich_reporter import RichReporter
-
-        return RichReporter(out)
-    return LineReporter(out)
-
-
 class Throttle:
     """Lets the first, the last, and one progress line every ``every`` seconds through."""
 

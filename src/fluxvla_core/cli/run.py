@@ -137,8 +137,8 @@ class Run:
                 configured = plan.config.tree[plan.section].get("resume_from")
                 refuse_overwriting(plan.work_dir, asked or configured)
         if plan.trains and _launches(args):
+            from fluxvla_core.cli.choose_reporter import make_reporter
             from fluxvla_core.cli.launch import launch
-            from fluxvla_core.cli.reporters import make_reporter
 
             grace = args.grace or ranks.GRACE_S
             reporter = make_reporter(args.log_format)

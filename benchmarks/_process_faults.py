@@ -27,9 +27,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._process_program import BLOCKED_S, PROVOKED, SENT
+from benchmarks._cyclone import CycloneCamera, fast_dds_environment
+from benchmarks._process_program import BLOCKED_S, PROVOKED, SENT, FullSizeArm
 from benchmarks._robot_faults import (
     ARM,
+    CAMERAS,
     GOES_ON,
     GOING_ON,
     MOVING,
@@ -90,7 +92,13 @@ class Program:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "fluxvla_core", *map(str, line)],
             cwd=ROOT,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "TERM": "dumb", name: value},
+            env={
+                **os.environ,
+                **stage.environment,
+                "OMP_NUM_THREADS": "1",
+                "TERM": "dumb",
+                name: value,
+            },
             pass_fds=(reads,),
             stdin=screen,
             stdout=screen,
@@ -194,14 +202,16 @@ def play(stage: Stage, fault: Fault) -> Result:
         AssertionError: a command that was received is outside a limit, or moves the arm after
             the run was over; or a process is left.
     """
-    steps = MOVING + GOING_ON + int(BLOCKED_S * ARM.rate_hz)
+    stage.folder.mkdir(parents=True, exist_ok=True)
+    going_on = MOVING + GOING_ON + int(BLOCKED_S * ARM.rate_hz)
+    steps = going_on if fault.outcome == GOES_ON else 10_000
     start = time.monotonic()
-    with program(stage, steps if fault.outcome == GOES_ON else 10_000) as running:
+    with fault.around(stage), program(stage, steps) as running:
         running.wait_for(lambda: len(stage.commands()) >= MOVING, "the first command", START_S)
         provoked = running.process.poll() is None
         began = time.monotonic()
         if provoked:
-            fault.provoke(running)
+            provoked = fault.provoke(running) is not False
         running.wait_for(lambda: False, "the end", END_S)
         ended = time.monotonic()
         until = ended + END_S
@@ -279,6 +289,28 @@ def pause(running: Program) -> None:
     running.process.send_signal(signal.SIGCONT)
 
 
+def cyclone_driver(stage: Stage) -> CycloneCamera:
+    """Before the run: cameras of 640x480 and a second driver of theirs, on Cyclone DDS."""
+    stage.arm = FullSizeArm.__name__
+    stage.environment = fast_dds_environment(stage.folder)
+    stage.robot.tell(change={topic: {"height": 480, "width": 640, "hz": 10} for topic in CAMERAS})
+    camera = CycloneCamera(*CAMERAS, height=480, width=640, hz=30)
+    stage.more.append(camera)
+    return camera
+
+
+def cyclone_images(running: Program) -> bool:
+    """When pieces of an image from Cyclone DDS are lost, Fast DDS spins in ``rcl_take`` and keeps
+    the GIL; only SIGKILL ends that process. A starved machine may stop the arm before."""
+    running.order("note the time")
+    (camera,) = running.stage.more
+    camera.start()
+    running.wait_for(running.at_rest, "freezing", END_S)
+    frozen = time.monotonic() - float((running.stage.folder / PROVOKED).read_text()) > 0.5
+    running.process.kill()
+    return frozen
+
+
 def kill_both(running: Program) -> None:
     control = running.control
     running.process.kill()
@@ -310,6 +342,13 @@ _FAULTS = [
         rule=MAIN,
     ),
     Fault("image callback spins for 5 s", order("image callback spins"), LOCKED, rule=MAIN),
+    Fault(
+        "image reception frozen (reliable images from Cyclone DDS)",
+        cyclone_images,
+        LOCKED,
+        around=cyclone_driver,
+        exit_code=-signal.SIGKILL,
+    ),
     Fault("policy crashes (segmentation fault)", order("crash"), KILLED, exit_code=-signal.SIGSEGV),
     Fault(
         "policy uses all memory",

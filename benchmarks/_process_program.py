@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,9 @@ BLOCKED_S = 5.0
 # Lengths of a driver's warnings that fill what the processes share in a second, to the last byte.
 FLOOD_BYTES = (100_000, 10_000, 1000, 100, 1)
 DRIVER = logging.getLogger("driver")
+
+
+FULL_SIZE = replace(ARM, cameras=tuple(replace(c, height=480, width=640) for c in ARM.cameras))
 
 
 @RUNNERS.register_module()
@@ -57,6 +61,13 @@ class ProgramArm(BenchArm):
         if self._flood.exists():
             for length in FLOOD_BYTES:
                 DRIVER.warning("x" * length)
+
+
+@OPERATORS.register_module()
+class FullSizeArm(ProgramArm):
+    """Its images have the size of a usual camera's: more than a packet."""
+
+    embodiment = FULL_SIZE
 
 
 @OPERATORS.register_module()
@@ -218,6 +229,19 @@ def stand_in_for_a_link_whose_thread_ends(policy: HarmfulSwing) -> None:
     Link.receive = receive  # type: ignore[method-assign]
 
 
+def note_the_time(policy: HarmfulSwing) -> None:
+    """Until this process runs no Python any more: what is stored then is when that began."""
+    file = os.open(policy.folder / PROVOKED, os.O_CREAT | os.O_WRONLY)
+
+    def note() -> None:
+        while True:
+            # In place: the file is whole at any moment.
+            os.pwrite(file, f"{time.monotonic():020.6f}".encode(), 0)
+            time.sleep(0.001)
+
+    threading.Thread(target=note, daemon=True).start()
+
+
 def in_get_frame(name: str) -> Callable[[HarmfulSwing], None]:
     """``WholeArm``, in the control process, does it."""
     return lambda policy: (policy.folder / name).touch()
@@ -236,6 +260,7 @@ HARMS: Mapping[str, Callable[[HarmfulSwing], None]] = {
     "image callback spins": stand_in_for_an_image_callback_that_spins,
     "link is not read": stand_in_for_a_link_that_is_not_read,
     "hook blocks": block_a_hook,
+    "note the time": note_the_time,
     "link's thread ends": stand_in_for_a_link_whose_thread_ends,
     "get_frame blocks": in_get_frame(BLOCK),
     "get_frame keeps the interpreter": in_get_frame(KEEP),

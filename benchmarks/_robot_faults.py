@@ -14,7 +14,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ ARM = EmbodimentSpec(
     50.0,
 )
 STATE, COMMAND = "/arm/state", "/arm/command"
+CAMERAS = tuple(f"/{camera.name}/image" for camera in ARM.cameras)
 STREAMS: list[dict[str, Any]] = [
     {
         "topic": STATE,
@@ -61,8 +62,7 @@ STREAMS: list[dict[str, Any]] = [
         "positions": [0.0, 0.0, 0.5],
         "follows": COMMAND,
     },
-    {"topic": "/cam/image", "message": IMAGE, "hz": 30, "height": 48, "width": 64},
-    {"topic": "/wrist_cam/image", "message": IMAGE, "hz": 30, "height": 48, "width": 64},
+    *({"topic": t, "message": IMAGE, "hz": 30, "height": 48, "width": 64} for t in CAMERAS),
 ]
 SINKS = [{"topic": COMMAND, "message": JOINT_STATE}]
 # How many commands are seen before a fault, and after one that must change nothing.
@@ -149,7 +149,8 @@ class Stage:
     most: int = 1000
     # What a program of its own drives.
     arm: str = "ProgramArm"
-    more: list[Driver] = field(default_factory=list)
+    environment: Mapping[str, str] = field(default_factory=dict)
+    more: list[Any] = field(default_factory=list)
 
     def runner(self) -> BaseInferenceRunner:
         context = RunContext(section="inference", work_dir=self.folder, task=self.task)
@@ -179,7 +180,8 @@ class Fault:
     Args:
         name: as docs/safety.md has it.
         provoke: called with the stage (or the ``Program`` of two processes) once the arm moves;
-            before the run for what is ``REFUSED``.
+            before the run for what is ``REFUSED``. False if it did not come about.
+        around: called with the stage before the run, which is inside of the context.
         says: what the one line that names the cause contains, a regular expression.
         outcome: ``STOP``, ``REFUSED`` or ``GOES_ON``.
         exit_code: of the program.
@@ -195,6 +197,7 @@ class Fault:
     outcome: str = STOP
     exit_code: int = 1
     rule: str | None = None
+    around: Callable[[Stage], AbstractContextManager[object]] = nullcontext
     after: Callable[[Stage], object] | None = None
     braked: bool = True
 

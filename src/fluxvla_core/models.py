@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from fluxvla_core.training.export import embodiment_in as embodiment_in
     from fluxvla_core.training.model import built_without_memory as built_without_memory
     from fluxvla_core.training.model import has_values as has_values
+    from fluxvla_core.training.model import weights_follow as weights_follow
 
 __getattr__, __dir__, __all__ = _lazy.attach(
     __name__,
@@ -60,7 +61,7 @@ __getattr__, __dir__, __all__ = _lazy.attach(
         "fluxvla_core.contracts.training": ["PartWeights", "VLA"],
         "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
         "fluxvla_core.policies.loading": ["load_policy"],
-        "fluxvla_core.training.model": ["built_without_memory", "has_values"],
+        "fluxvla_core.training.model": ["built_without_memory", "has_values", "weights_follow"],
         "fluxvla_core.training.export": ["embodiment_in"],
     },
 )

@@ -285,4 +285,4 @@ def untrained_model(ckpt_path: str, device: str) -> Any:
 
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return model_of(Checkpoint.open(ckpt_path)).to(device).eval()
+        return model_of(Checkpoint.open(ckpt_path), untrained=True).to(device).eval()

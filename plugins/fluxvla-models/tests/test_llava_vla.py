@@ -1,4 +1,4 @@
-"""LlavaVLA of tiny pretrained parts: it trains, acts, and neither padding nor company matters."""
+"""LlavaVLA of tiny pretrained parts: it trains and acts; padding and batch size do not matter."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_every_parameter_is_trained(folders, make) -> None:
 
 
 @pytest.mark.parametrize("make", [halves, whole])
-def test_padding_on_either_side_and_company_do_not_matter(folders, make) -> None:
+def test_padding_on_either_side_and_other_samples_do_not_matter(folders, make) -> None:
     model = make(folders).eval()
     batch = asked(batch_of())
     with torch.inference_mode():
@@ -173,7 +173,7 @@ def test_padding_on_either_side_and_company_do_not_matter(folders, make) -> None
 
 
 @pytest.mark.parametrize("make", [halves, whole])
-def test_what_is_seen_read_and_felt_matters_and_a_missing_camera_does_not(folders, make) -> None:
+def test_images_words_and_states_matter_and_a_missing_camera_does_not(folders, make) -> None:
     model = make(folders).eval()
     batch = asked(batch_of())
     with torch.inference_mode():
@@ -314,7 +314,7 @@ def test_missing_weights_are_not_drawn_in_silence(folders, tmp_path: Path) -> No
         Qwen3Backbone(str(tmp_path))
 
 
-def test_weights_of_other_sizes_are_told_with_both(folders: dict[str, str], tmp_path: Path) -> None:
+def test_weights_of_other_sizes_are_listed(folders: dict[str, str], tmp_path: Path) -> None:
     folder = tmp_path / "wider"
     shutil.copytree(folders["qwen3"], folder)
     config = json.loads((folder / "config.json").read_text())
@@ -423,5 +423,5 @@ def test_its_latency_is_measured(folders: dict[str, str], tmp_path: Path) -> Non
     (tmp_path / "embodiment.json").write_text(json.dumps(robot.to_dict()))
     config = tmp_path / "llava.py"
     config.write_text(f"model = {model!r}\ntrain_dataloader = dict(dataset={dataset!r})\n")
-    told = ["--config", str(config), "--embodiment", str(tmp_path)]
-    assert stages_measured(told, tmp_path / "measured") == WHOLE
+    options = ["--config", str(config), "--embodiment", str(tmp_path)]
+    assert stages_measured(options, tmp_path / "measured") == WHOLE

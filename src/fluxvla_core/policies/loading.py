@@ -188,7 +188,7 @@ def _model(checkpoint: Checkpoint, device: str) -> Any:
 
 
 def _try(prepare: Any, denormalize: Any, robot: EmbodimentSpec, horizon: int, where: str) -> None:
-    """Try them before weights are read; cameras that the robot lacks are told by what drives it."""
+    """Try them before weights are read; who drives the robot reports cameras that it lacks."""
     sizes = {camera.name: (camera.height, camera.width) for camera in robot.cameras}
     keys = getattr(prepare, "img_keys", ())
     if all(camera_name(key) in sizes for key in keys):

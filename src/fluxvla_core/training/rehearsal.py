@@ -15,11 +15,10 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import (
     RunContext,
-    build_operator_from_cfg,
     build_runner_from_cfg,
     build_vla_from_cfg,
+    robot_of,
 )
-from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.example import Example, Refused, example
 from fluxvla_core.errors import ConfigError, FluxError
@@ -48,7 +47,7 @@ class Rehearsal:
     """What is known of a training before it runs.
 
     Args:
-        robot: of ``inference.operator``.
+        robot: that the policy acts on; see ``robot_of``.
         data: a sample.
         batch: the collator's: name -> shape and dtype.
         model: name of its class.
@@ -201,16 +200,8 @@ def _count(
 
 
 def _robot(config: Mapping[str, Any], notes: list[str]) -> EmbodimentSpec | None:
-    section = config.get("inference")
-    table = section.get("operator") if isinstance(section, Mapping) else None
-    if table is None:
-        return None
     try:
-        operator = Operator.adapt(build_operator_from_cfg(table))
-        try:
-            return operator.embodiment
-        finally:
-            operator.close()
+        return robot_of(config)
     except Exception as error:  # noqa: BLE001 - another's class; what is left is still of use
         notes.append(f"the robot is not known: {_told(error)}")
         return None

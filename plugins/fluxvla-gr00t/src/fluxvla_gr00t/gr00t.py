@@ -19,7 +19,7 @@ class GR00T(VLA, nn.Module):
     """Images, instruction and joint state in, action chunk out: GR00T N1.5 and N1.7.
 
     N1.5 is ``EagleBackbone`` and ``GR00TActionHead`` as they are; N1.7 is ``Qwen3VLBackbone`` and
-    a ``GR00TActionHead`` with N1.7's numbers (configs/gr00t has both).
+    a ``GR00TActionHead`` with N1.7's numbers (``configs/gr00t_n15_*.py``, ``gr00t_n17_*.py``).
 
     Args:
         vlm_backbone: table or module; images and tokens -> ``Context``.

@@ -347,7 +347,7 @@ def built(kind: Any, folder: Path | None, config: Any, pretrained: bool) -> nn.M
             use_safetensors=True,
             trust_remote_code=False,
             output_loading_info=True,
-            ignore_mismatched_sizes=True,  # they are told below
+            ignore_mismatched_sizes=True,  # they are reported below
         )
     except Exception as error:  # whatever damaged files make transformers raise
         raise ConfigError(

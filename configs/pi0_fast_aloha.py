@@ -15,7 +15,7 @@ DATASET = "datasets/aloha_example"
 HORIZON = 50  # 1 s at 50 Hz
 DIMENSIONS = 14
 
-model = dict(n_action_steps=HORIZON, action_dim=DIMENSIONS, max_decoding_steps=180)
+model = dict(n_action_steps=HORIZON, action_dim=DIMENSIONS, max_decoding_steps=256)
 
 train_dataloader = dict(
     dataset=dict(
@@ -37,7 +37,7 @@ train_dataloader = dict(
                 tokenizer=dict(type="PretrainedTokenizer", model_path=TOKENIZER),
                 max_len=140,
             ),
-            dict(type="ProcessActionTokens", tokenizer=FAST, max_len=180),
+            dict(type="ProcessActionTokens", tokenizer=FAST, max_len=256),
         ],
     )
 )

@@ -48,10 +48,8 @@ class SigLIPBackbone(nn.Module):
         sizes: Sizes | None = None,
     ) -> None:
         super().__init__()
-        kinds = ("siglip", "siglip_vision_model")
-        folder, config = described(model_folder, kinds, pretrained, sizes)
-        if config.model_type == "siglip":
-            config = config.vision_config
+        kinds = ("siglip_vision_model", "siglip")
+        folder, config = described(model_folder, kinds, pretrained, sizes, "vision_config")
         self.sizes = sizes_of(config)
         config.vision_use_head = False  # it pools all patches into one feature
         from transformers import SiglipVisionModel
@@ -209,10 +207,17 @@ class PaliGemmaBackbone(nn.Module):
 
 
 def described(
-    model_folder: str, kinds: Sequence[str], pretrained: bool, sizes: Sizes | None
+    model_folder: str,
+    kinds: Sequence[str],
+    pretrained: bool,
+    sizes: Sizes | None,
+    part: str | None = None,
 ) -> tuple[Path | None, Any]:
     """The folder and the transformers configuration in it; None and that of ``sizes``, where the
     folder is absent and its weights are not needed.
+
+    Args:
+        part: the configuration inside that one that is meant, where there is such a one.
 
     Raises:
         ConfigError: as of ``SigLIPBackbone``.
@@ -222,12 +227,14 @@ def described(
     except ConfigError as error:
         absent = not Path(model_folder).expanduser().exists()
         if sizes is not None and absent and (weights_follow() or not pretrained):
-            return None, config_of(sizes, kinds)
+            return None, config_of(sizes, kinds[:1])
         if absent and error.next is not None:
             error.next += "; for a dry run without it: sizes=dict(...), values of its config.json"
         raise
     config = read_config(folder, kinds)
+    config = config if part is None else getattr(config, part, config)
     if sizes is not None:
+        config_of(sizes, kinds[:1])
         _compare(sizes, config, str(folder / "config.json"))
     return folder, config
 
@@ -266,7 +273,7 @@ def sizes_of(config: Any) -> dict[str, Any]:
 
 
 def _check_names(sizes: Sizes, config: Any, at: str) -> None:
-    known = config.to_dict()
+    known = {*config.to_dict(), "head_dim"}  # not a field of all, and read by all
     for name, value in sizes.items():
         if name in _REFUSED or name.startswith("_") or name not in known:
             raise ConfigError(

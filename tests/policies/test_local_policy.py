@@ -12,7 +12,7 @@ import pytest
 
 from fluxvla_core.errors import CheckpointError, ConfigError, DataError, SpecMismatch
 from fluxvla_core.plugins.registry import VLAS
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
 safetensors = pytest.importorskip("safetensors.torch")

@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, RunFailed
-from fluxvla_core.plugins.files import load_plugin_files, plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files, plugin_files
 from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
 
 Work = Callable[[Any], Any]

@@ -1,6 +1,6 @@
 """Check that plugins can be imported, each distribution in a process of its own.
 
-What an import does (hang, crash, print, change the process) stays there.
+An import may hang, crash, print or change its process.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def problems(
 
     Args:
         plugins: of groups that the core reads.
-        limit_s: for one import. Of a distribution that has one that takes longer, no other module
+        limit_s: for one import. After one that takes longer, no other module of its distribution
             is tried: they may all wait for the same thing.
-        traces: with the tracebacks of what was raised.
+        traces: include tracebacks.
         begins: called with the plugins of each distribution when its turn comes.
     """
     in_order = sorted(plugins, key=lambda p: (p.origin, p.module))
@@ -74,7 +74,7 @@ class _Importer:
     Attributes:
         connection: readable when there is an answer.
         deadline: of the import under way, on the monotonic clock.
-        rest: the plugins that another process is to try, once this one is ``done``.
+        rest: plugins for another process to try, once this one is ``done``.
     """
 
     def __init__(self, plugins: Plugins, limit_s: float, traces: bool) -> None:
@@ -137,7 +137,7 @@ class _Importer:
 
 
 def _import(connection: Connection, plugins: Plugins, traces: bool) -> None:
-    """A process's life: one answer a plugin, empty if all is well with it."""
+    """The process: sends one problem per plugin, empty if there is none."""
     leave_stopping_to_the_parent()
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):

@@ -39,7 +39,7 @@ from fluxvla_core.ros2.streams import (
     Stream,
     StreamSpec,
 )
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger("fluxvla.ros2")

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control import realtime
 from fluxvla_core.control.interrupt import Interrupted
 from fluxvla_core.control.joiners import make_joiner

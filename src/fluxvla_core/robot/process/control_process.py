@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.interrupt import Interrupts
 from fluxvla_core.control.safety import Rule
 from fluxvla_core.errors import RunFailed, SafetyStop

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import STATE, Frame, RobotFrame
 from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.robot.operator_values import is_number
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 AnyArray = npt.NDArray[Any]
 _ASKED, _ANSWERED, _LENGTH = 0, 1, 2

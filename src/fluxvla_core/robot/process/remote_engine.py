@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control import realtime
 from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.control.policy_client import PolicyClient

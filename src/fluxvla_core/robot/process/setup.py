@@ -19,17 +19,23 @@ from fluxvla_core.build import (
     build_operator_from_cfg,
     build_runner_from_cfg,
 )
-from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter, Operator
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.safety import SafetySettings
 from fluxvla_core.control.sender import ExecuteActions
-from fluxvla_core.plugins.files import load_plugin_files, plugin_files
-from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS, RUNNERS
+from fluxvla_core.plugins.registry import (
+    ACTION_FILTERS,
+    BY_NAME,
+    OPERATORS,
+    RUNNERS,
+    load_plugin_files,
+    plugin_files,
+)
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.options import build_filters
 from fluxvla_core.robot.process.undivided_robot import UndividedRobot
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 
 @dataclass(frozen=True)

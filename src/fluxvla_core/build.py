@@ -22,7 +22,7 @@ from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
 from fluxvla_core.registries import ROWS, RegistryRow
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 T = TypeVar("T")
 

@@ -159,6 +159,7 @@ class GR00T(VLA, nn.Module):
         if bool(((ids < 0) | (ids >= known)).any()):
             raise ConfigError(
                 f"embodiment_ids {ids.tolist()} are not all in 0..{known - 1}, the embodiments "
-                "that the head has layers for"
+                "that the head has layers for",
+                next="--set train_dataloader.dataset.embodiment_id=N: the number of the robot",
             )
         return ids.long()

@@ -223,10 +223,10 @@ def by_hand(setup: Setup) -> Callable[[int], float]:
             torch.nn.utils.clip_grad_norm_(model.parameters(), MAX_NORM)
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        told = loss.detach()
+        summed = loss.detach()
         if setup.nproc > 1:
-            dist.all_reduce(told)
-        return float(told) / setup.nproc
+            dist.all_reduce(summed)
+        return float(summed) / setup.nproc
 
     return run
 

@@ -57,14 +57,14 @@ def summarise(runs: Mapping[str, Sequence[Found]], setup: Setup) -> dict[str, An
     sides = {}
     for side, rounds in runs.items():
         seconds = statistics.median(s for found in rounds for s in found["step_s"])
-        told = [share for found in rounds for share in found.get("mfu", ())]
-        if not told and counted is not None:
-            told = [counted / seconds / ours["peak_flops"]]
+        shares = [share for found in rounds for share in found.get("mfu", ())]
+        if not shares and counted is not None:
+            shares = [counted / seconds / ours["peak_flops"]]
         sides[side] = {
             "samples_per_s": samples / seconds,
             "step_s": seconds,
             "steps_s": [found["step_s"] for found in rounds],
-            "mfu": statistics.median(told) if told else None,
+            "mfu": statistics.median(shares) if shares else None,
             "peak_memory_gb": max(found["peak_bytes"] for found in rounds) / cost.GB,
             "last_loss": rounds[-1]["last_loss"],
         }

@@ -61,6 +61,7 @@ FAMILIES = {
     "OpenVLA-OFT": Family(
         "openvla_oft_libero_full", "openvla_oft_libero", "openvla_oft_libero_frozen"
     ),
+    "LlavaVLA": Family("llava_aloha_full", "llava_aloha_lora", "llava_aloha_frozen"),
     "CompactVLA": Family("aloha_sim_transfer"),
     "ACT": Family("aloha_sim_act"),
     "Diffusion Policy": Family("aloha_sim_diffusion"),

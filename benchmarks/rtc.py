@@ -3,7 +3,7 @@
     python -m benchmarks.rtc [--checkpoint work_dirs/aloha_sim_pi05_tiny] [--episodes 10]
 
 The tiny PI0.5 of ``configs/aloha_sim_pi05_tiny.py`` hands the cube over in the simulated ALOHA. It
-is asked every 0.5 s and answers after a delay, which is simulated as in ``chunk_joining.py``. In
+is queried every 0.5 s and answers after a delay, simulated as in ``chunk_joining.py``. In
 each row another joiner goes from one chunk to the next: the new one replaces the old one
 (``latest_only``), is faded in (``overlap``), averaged with it (``temporal_ensemble``) or continues
 it by guidance in every denoising step (``rtc``; a policy that was trained with

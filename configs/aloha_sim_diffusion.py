@@ -7,7 +7,7 @@ fluxvla run --config configs/aloha_sim_diffusion.py --section eval
 fluxvla run --config configs/aloha_sim_diffusion.py --section inference --task 1
 
 Hyperparameters are those of the convolutional policy in the appendix of arXiv 2303.04137: two
-observations, the present one and that of the action before, 16 actions, of which 8 are executed.
+observations, the present one and that of the action before, 16 actions; 8 are executed.
 """
 
 DATASET = "work_dirs/aloha_sim_diffusion/dataset"

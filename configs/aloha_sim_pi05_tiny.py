@@ -48,7 +48,7 @@ train_dataloader = dict(
             # positions, and the tower finds it in fewer steps.
             dict(type="NormalizeImages", means=[[80.0] * 3], stds=[[30.0] * 3]),
             dict(type="StateNoise", std=0.02, state_key="proprio"),
-            # States are told in 256 steps of their range.
+            # The prompt has states in 256 steps of their range.
             dict(
                 type="NormalizeStatesAndActions",
                 state_key="proprio",

@@ -17,10 +17,12 @@ from fluxvla_core.config.resolve import INJECTED
 from fluxvla_core.config.runtime_signature import misfits, option_names
 from fluxvla_core.config.signature import OPTIONS_KEYWORDS
 from fluxvla_core.config.tree import join_key
+from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
 from fluxvla_core.registries import ROWS, RegistryRow
+from fluxvla_core.spec import EmbodimentSpec
 
 T = TypeVar("T")
 
@@ -181,6 +183,31 @@ def _explained(cls: type, cfg: Mapping[str, Any], context: RunContext | None) ->
         for one in wrong
     ]
     return ConfigError.from_problems(tuple(problems), next=f"fluxvla plugins show {cls.__name__}")
+
+
+def robot_of(config: Mapping[str, Any]) -> EmbodimentSpec | None:
+    """The robot that a config's policy acts on; None where the config does not say.
+
+    It is that of ``inference.operator``, or what the ``robot_spec()`` of the runner of the section
+    ``inference`` or ``eval`` returns, which a runner of one simulated robot has.
+
+    Raises:
+        ConfigError, PluginError: what is named cannot be built here.
+    """
+    sections = [config.get(name) for name in ("inference", "eval")]
+    tables = [section for section in sections if isinstance(section, Mapping)]
+    if tables and tables[0] is sections[0] and tables[0].get("operator") is not None:
+        operator = Operator.adapt(build_from_cfg(tables[0]["operator"], BY_NAME["operators"]))
+        try:
+            return operator.embodiment
+        finally:
+            operator.close()
+    for table in tables:
+        described = getattr(_class_of(table.get("type"), BY_NAME["runners"]), "robot_spec", None)
+        if described is not None:
+            robot: EmbodimentSpec = described()
+            return robot
+    return None
 
 
 def _class_of(name: Any, registry: Registry) -> type:

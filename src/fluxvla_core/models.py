@@ -33,5 +33,6 @@ if TYPE_CHECKING:
     from fluxvla_core.training.export import embodiment_in as embodiment_in
     from fluxvla_core.training.model import built_without_memory as built_without_memory
     from fluxvla_core.training.model import has_values as has_values
+    from fluxvla_core.training.model import weights_follow as weights_follow
 
 __getattr__, __dir__, __all__ = _lazy.attach(__name__)

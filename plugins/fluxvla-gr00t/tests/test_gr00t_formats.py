@@ -292,7 +292,7 @@ def test_a_processor_of_another_policy_is_refused(tmp_path, monkeypatch):
 @pytest.mark.parametrize("version", ["n1.5", "n1.7"])
 @pytest.mark.parametrize("stem", ["policy_preprocessor", "policy_postprocessor"])
 def test_a_step_that_is_not_done_here_is_refused(version, stem, tmp_path, monkeypatch):
-    """It would change what the model or the robot is told, and be lost without a word."""
+    """It would change inputs or commands, and be lost silently."""
     source = published.lerobot_folder(version, tmp_path / "theirs", monkeypatch)
     file = source / f"{stem}.json"
     steps = json.loads(file.read_text())["steps"]

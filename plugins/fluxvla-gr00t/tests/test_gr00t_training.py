@@ -172,8 +172,8 @@ def test_a_dry_run_counts_what_its_training_keeps(version, frozen, dtype):
         bare = made()
     samples = [Samples(version).get_sample(i, 0) for i in range(3)]
     batch = {k: torch.from_numpy(np.stack([sample[k] for sample in samples])) for k in KEYS}
-    told, found = kept_by_fake(fake(bare), batch, dtype), kept(made(), batch, dtype)
+    estimate, found = kept_by_fake(fake(bare), batch, dtype), kept(made(), batch, dtype)
     assert found.activations > 0
-    assert told.activations == pytest.approx(found.activations, rel=0.01)
-    assert told.recomputed == pytest.approx(found.recomputed, rel=0.01)
-    assert told.weight_copies == found.weight_copies
+    assert estimate.activations == pytest.approx(found.activations, rel=0.01)
+    assert estimate.recomputed == pytest.approx(found.recomputed, rel=0.01)
+    assert estimate.weight_copies == found.weight_copies

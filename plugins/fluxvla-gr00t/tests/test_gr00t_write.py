@@ -72,8 +72,8 @@ def made(version: str, **more: object) -> ForeignCheckpoint:
 def test_it_comes_back_as_it_went(version, tmp_path, monkeypatch):
     source = folders.lerobot_folder(version, tmp_path / "theirs", monkeypatch)
     words = folders.tokenizer(version, tmp_path / "words")
-    told = ["--tokenizer", str(words), "--rate", "20"]
-    assert main(["import-checkpoint", str(source), str(tmp_path / "ours"), *told]) == 0
+    options = ["--tokenizer", str(words), "--rate", "20"]
+    assert main(["import-checkpoint", str(source), str(tmp_path / "ours"), *options]) == 0
     back = tmp_path / "back"
     assert main(["export", str(tmp_path / "ours"), str(back), "--format", "lerobot"]) == 0
 

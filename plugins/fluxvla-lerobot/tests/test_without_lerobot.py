@@ -220,9 +220,9 @@ def test_without_lerobot_it_says_what_to_install(
     monkeypatch.setattr(installed, "installed_version", lambda: None)
     monkeypatch.setattr("fluxvla_lerobot.policy.installed_version", lambda: None)
     for make in (lerobot, lambda: LeRobotPolicy(str(folder))):
-        with pytest.raises(LoadFailed, match="LeRobotPolicy needs LeRobot, which is not") as told:
+        with pytest.raises(LoadFailed, match="LeRobotPolicy needs LeRobot, which is not") as error:
             make()
-        assert "pip install 'fluxvla-lerobot[lerobot]'" in str(told.value)
+        assert "pip install 'fluxvla-lerobot[lerobot]'" in str(error.value)
 
 
 def test_a_lerobot_that_cannot_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:

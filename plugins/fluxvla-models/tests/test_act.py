@@ -141,15 +141,15 @@ def test_batches_that_do_not_fit() -> None:
         model(**{**batch, "actions": batch["actions"][:, :3]})
     with pytest.raises(ConfigError, match=r"num_cameras is 2, .* 3 image channels \(1 cameras\)"):
         model(**{**batch, "images": batch["images"][:, :3]})
-    with pytest.raises(ConfigError, match=r"latent_noise of shape \(4, 6\), got none") as told:
+    with pytest.raises(ConfigError, match=r"latent_noise of shape \(4, 6\), got none") as message:
         model(**{**batch, "latent_noise": None})
-    assert "SampleLatentNoise" in str(told.value.next)
+    assert "SampleLatentNoise" in str(message.value.next)
     with pytest.raises(ConfigError, match=r"got one of shape \(4, 5\)"):
         model(**{**batch, "latent_noise": batch["latent_noise"][:, :5]})
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"dim_model": 30}, "dim_model 30 must be a multiple of n_heads 4 and of 4"),
         ({"backbone": "resnet50"}, "'resnet50' of a residual network is not one of resnet18, re"),
@@ -157,8 +157,8 @@ def test_batches_that_do_not_fit() -> None:
         ({"feedforward_activation": "glu"}, "activation 'glu' is not one of relu, gelu"),
     ],
 )
-def test_settings_that_do_not_work(settings: dict[str, object], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_settings_that_do_not_work(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         make(**settings)
 
 

@@ -1,4 +1,4 @@
-"""Bad input to ACT, Diffusion Policy and parts of others: what is told, from the command line."""
+"""Bad input to ACT, Diffusion Policy and parts of others: errors, from the command line."""
 
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ def test_keypoints_find_a_peak() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"horizon": 10}, r"horizon 10 is not a multiple of 4"),
         ({"down_dims": (12, 24), "horizon": 8}, r"down_dims \(12, 24\) must be multiples of n_gr"),
@@ -180,8 +180,8 @@ def test_keypoints_find_a_peak() -> None:
         ({"num_inference_steps": 21}, "num_inference_steps 21 is not between 1 and num_train_time"),
     ],
 )
-def test_settings_that_do_not_work(settings: dict[str, object], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_settings_that_do_not_work(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         make(**settings)
 
 

@@ -156,7 +156,7 @@ def test_normalising_by_each_mode(folder: Path, mode: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change_config", "told"),
+    ("change_config", "message"),
     [
         ({"n_obs_steps": 2}, "n_obs_steps is 2, only 1 is built here"),
         ({"replace_final_stride_with_dilation": True}, "replace_final_stride_with_dilation is Tr"),
@@ -167,11 +167,11 @@ def test_normalising_by_each_mode(folder: Path, mode: str) -> None:
     ],
 )
 def test_what_is_not_built_here_is_refused_in_words(
-    folder: Path, tmp_path: Path, capsys, change_config: dict, told: str
+    folder: Path, tmp_path: Path, capsys, change_config: dict, message: str
 ) -> None:
     change(folder / "config.json", **change_config)
     assert main(["import-checkpoint", str(folder), str(tmp_path / "ours")]) == 2
-    assert re.search(told, capsys.readouterr().err)
+    assert re.search(message, capsys.readouterr().err)
     assert not (tmp_path / "ours").exists()
 
 
@@ -185,7 +185,7 @@ def test_numbers_of_observations_that_make_no_sense(tmp_path: Path, steps: objec
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "message"),
     [
         ({"input_features": [1]}, "input_features is no table"),
         (
@@ -197,16 +197,16 @@ def test_numbers_of_observations_that_make_no_sense(tmp_path: Path, steps: objec
         ({"normalization_mapping": 3}, "normalization_mapping is no table"),
     ],
 )
-def test_a_config_that_nobody_wrote(folder: Path, values: dict, told: str) -> None:
+def test_a_config_that_nobody_wrote(folder: Path, values: dict, message: str) -> None:
     change(folder / "config.json", **values)
-    with pytest.raises(CheckpointError, match=told):
+    with pytest.raises(CheckpointError, match=message):
         LeRobotACT().read(folder)
 
 
 def test_processors_that_nobody_wrote(folder: Path) -> None:
     file = folder / "policy_preprocessor.json"
     content = json.loads(file.read_text())
-    for values, told in (
+    for values, message in (
         ({"config": 3}, "config is no table"),
         ({"config": {"eps": "x"}}, "eps is 'x'; a normalizer with 1e-08 is read"),
         ({"config": {"eps": 1e-5}}, "eps is 1e-05; a normalizer with 1e-08 is read"),
@@ -219,7 +219,7 @@ def test_processors_that_nobody_wrote(folder: Path) -> None:
     ):
         steps = [{**step, **values} if "state_file" in step else step for step in content["steps"]]
         change(file, steps=steps)
-        with pytest.raises(CheckpointError, match=told):
+        with pytest.raises(CheckpointError, match=message):
             LeRobotACT().read(folder)
     for text in ("[]", "{", '{"steps": 3}'):
         file.write_text(text)
@@ -229,7 +229,7 @@ def test_processors_that_nobody_wrote(folder: Path) -> None:
 
 @pytest.mark.parametrize("stem", ["policy_preprocessor", "policy_postprocessor"])
 def test_a_step_that_is_not_done_here_is_refused(folder: Path, stem: str) -> None:
-    """It would change what the robot is told, and be lost without a word."""
+    """It would change commands, and be lost silently."""
     file = folder / f"{stem}.json"
     steps = json.loads(file.read_text())["steps"]
     more = {"registry_name": "absolute_actions_processor", "config": {"enabled": True}}
@@ -269,9 +269,9 @@ def test_missing_extra_and_misshapen_tensors_are_listed(
     tensors["model.decoder_pos_embed.weight"] = torch.zeros(9, 32)
     save_file(tensors, folder / "model.safetensors")
     assert main(["import-checkpoint", str(folder), str(tmp_path / "ours")]) == 2
-    told = capsys.readouterr().err
+    message = capsys.readouterr().err
     for words in ("action_head.bias", "surplus", "decoder_pos_embed.weight: (9, 32)"):
-        assert words in told
+        assert words in message
 
 
 @pytest.mark.parametrize("by_model", [True, False])

@@ -183,7 +183,7 @@ def test_every_normalisation_becomes_lerobots(tmp_path: Path, table: dict) -> No
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "message"),
     [
         ({"model": {**act().model, "backbone_norm": "group"}}, "backbone_norm is 'group'; LeRobot"),
         ({"model": {**act().model, "backbone_width": 16}}, "backbone_width is 16; LeRobot's ACT"),
@@ -219,15 +219,15 @@ def test_every_normalisation_becomes_lerobots(tmp_path: Path, table: dict) -> No
         ),
     ],
 )
-def test_what_lerobot_cannot_say_is_refused(tmp_path: Path, more: dict, told: str) -> None:
+def test_what_lerobot_cannot_say_is_refused(tmp_path: Path, more: dict, message: str) -> None:
     with pytest.raises(CheckpointError) as caught:
         LeRobotACT().write(act(**more), tmp_path)
-    assert re.search(told, str(caught.value))
+    assert re.search(message, str(caught.value))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "message"),
     [
         ({"backbone_norm": "frozen_batch"}, "backbone_norm is 'frozen_batch'"),
         (
@@ -237,10 +237,10 @@ def test_what_lerobot_cannot_say_is_refused(tmp_path: Path, more: dict, told: st
     ],
 )
 def test_diffusion_policies_that_lerobot_does_not_have(
-    tmp_path: Path, more: dict, told: str
+    tmp_path: Path, more: dict, message: str
 ) -> None:
     model = {**act().model, "type": "DiffusionPolicy", "horizon": 8, **more}
     transforms = (*act().transforms[:3], {"type": "SampleDiffusionNoise"})
-    with pytest.raises(CheckpointError, match=told):
+    with pytest.raises(CheckpointError, match=message):
         LeRobotDiffusion().write(act(model=model, transforms=transforms), tmp_path)
     assert not list(tmp_path.iterdir())

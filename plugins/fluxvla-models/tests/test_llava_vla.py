@@ -1,4 +1,4 @@
-"""LlavaVLA of tiny pretrained parts: it trains, acts, and neither padding nor company matters."""
+"""LlavaVLA of tiny pretrained parts: it trains and acts; padding and batch size do not matter."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_every_parameter_is_trained(folders, make) -> None:
 
 
 @pytest.mark.parametrize("make", [halves, whole])
-def test_padding_on_either_side_and_company_do_not_matter(folders, make) -> None:
+def test_padding_on_either_side_and_other_samples_do_not_matter(folders, make) -> None:
     model = make(folders).eval()
     batch = asked(batch_of())
     with torch.inference_mode():
@@ -173,7 +173,7 @@ def test_padding_on_either_side_and_company_do_not_matter(folders, make) -> None
 
 
 @pytest.mark.parametrize("make", [halves, whole])
-def test_what_is_seen_read_and_felt_matters_and_a_missing_camera_does_not(folders, make) -> None:
+def test_images_words_and_states_matter_and_a_missing_camera_does_not(folders, make) -> None:
     model = make(folders).eval()
     batch = asked(batch_of())
     with torch.inference_mode():
@@ -275,7 +275,7 @@ def test_parts_that_do_not_go_together(folders) -> None:
         whole(folders, vision_backbone=vision)
     with pytest.raises(ConfigError, match="freeze_projector: the model has no projector"):
         whole(folders, freeze_projector=True)
-    with pytest.raises(ConfigError, match="the model is a qwen3; siglip or siglip_vision_model is"):
+    with pytest.raises(ConfigError, match="the model is a qwen3; siglip_vision_model or siglip is"):
         SigLIPBackbone(folders["qwen3"])
     with pytest.raises(ConfigError, match=r"not exist|no folder|there is no"):
         Qwen3Backbone(folders["qwen3"] + "x")
@@ -314,7 +314,7 @@ def test_missing_weights_are_not_drawn_in_silence(folders, tmp_path: Path) -> No
         Qwen3Backbone(str(tmp_path))
 
 
-def test_weights_of_other_sizes_are_told_with_both(folders: dict[str, str], tmp_path: Path) -> None:
+def test_weights_of_other_sizes_are_listed(folders: dict[str, str], tmp_path: Path) -> None:
     folder = tmp_path / "wider"
     shutil.copytree(folders["qwen3"], folder)
     config = json.loads((folder / "config.json").read_text())
@@ -423,5 +423,76 @@ def test_its_latency_is_measured(folders: dict[str, str], tmp_path: Path) -> Non
     (tmp_path / "embodiment.json").write_text(json.dumps(robot.to_dict()))
     config = tmp_path / "llava.py"
     config.write_text(f"model = {model!r}\ntrain_dataloader = dict(dataset={dataset!r})\n")
-    told = ["--config", str(config), "--embodiment", str(tmp_path)]
-    assert stages_measured(told, tmp_path / "measured") == WHOLE
+    options = ["--config", str(config), "--embodiment", str(tmp_path)]
+    assert stages_measured(options, tmp_path / "measured") == WHOLE
+
+
+BACKBONES = {
+    "siglip": SigLIPBackbone,
+    "siglip_both": SigLIPBackbone,
+    "qwen3": Qwen3Backbone,
+    "qwen2": Qwen2Backbone,
+    "llama": LlamaBackbone,
+    "paligemma": PaliGemmaBackbone,
+}
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_sizes_make_the_same_part_without_its_folder(folders: dict[str, str], name: str) -> None:
+    """From what a checkpoint stores: JSON."""
+    part = BACKBONES[name](folders[name])
+    sizes = json.loads(json.dumps(part.sizes))
+    again = BACKBONES[name]("nowhere", pretrained=False, sizes=sizes)
+    again.load_state_dict(part.state_dict())  # strict
+    assert again.sizes == part.sizes
+    assert again.out_dim == part.out_dim
+    theirs, ours = (p.model.config.to_dict() for p in (part, again))
+    differ = {key for key in theirs if theirs[key] != ours.get(key)}
+    assert differ <= {"architectures", "_name_or_path", "dtype", "vision_config", "text_config"}
+    BACKBONES[name](folders[name], sizes=sizes)  # and equal those in the folder
+
+
+def test_a_folder_may_be_absent_where_its_weights_are_not_needed(folders: dict[str, str]) -> None:
+    sizes = Qwen3Backbone(folders["qwen3"]).sizes
+    with torch.device("meta"):
+        assert len(Qwen3Backbone("nowhere", sizes=sizes).fsdp_units()) == 2
+    # A training would start from weights that are drawn anew, and nobody would notice.
+    with pytest.raises(ConfigError, match="'nowhere' does not exist"):
+        Qwen3Backbone("nowhere", sizes=sizes)
+    with pytest.raises(ConfigError, match="'nowhere' does not exist") as error:
+        Qwen3Backbone("nowhere")
+    assert "sizes=dict(...)" in str(error.value.next)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"hidden_size": 24}, r"sizes\.hidden_size is 24, config\.json has 16"),
+        ({"hidden": 24}, r"sizes\.hidden: a qwen3 has no such setting"),
+        ({"auto_map": {"AutoModel": "evil.Model"}}, r"sizes\.auto_map: a qwen3 has no such"),
+        ({"attn_implementation": "some/kernel"}, r"sizes\.attn_implementation: a qwen3 has no"),
+        ({"model_type": "qwen2"}, "sizes.model_type is 'qwen2'; qwen3 is expected"),
+    ],
+)
+def test_sizes_that_are_wrong(folders: dict[str, str], change: dict, words: str) -> None:
+    sizes = {**Qwen3Backbone(folders["qwen3"]).sizes, **change}
+    places = ["nowhere"] if "hidden_size" not in change else [folders["qwen3"]]
+    for place in {*places, folders["qwen3"]}:
+        with pytest.raises(ConfigError, match=words):
+            Qwen3Backbone(place, pretrained=False, sizes=sizes)
+
+
+def test_a_checkpoint_s_table_has_the_sizes_of_its_parts(folders: dict[str, str]) -> None:
+    table = {"type": "LlavaVLA", "projector": {"type": "FusedMLPProjector"}}
+    parts = {
+        "vision_backbone": {"type": "SigLIPBackbone", "model_folder": folders["siglip"]},
+        "llm_backbone": {"type": "Qwen3Backbone", "model_folder": folders["qwen3"]},
+    }
+    stored = halves(folders).checkpoint_table({**table, **parts, "vla_head": HEAD})
+    assert stored["llm_backbone"] == {
+        **parts["llm_backbone"],
+        "sizes": Qwen3Backbone(folders["qwen3"]).sizes,
+    }
+    assert stored["vision_backbone"]["sizes"]["patch_size"] == 16
+    assert stored["projector"] == table["projector"]
+    assert stored["vla_head"] == HEAD

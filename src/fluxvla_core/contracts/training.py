@@ -105,6 +105,13 @@ class VLA(Contract):
         ``runner.init_from`` nor ``pretrained_name_or_path`` names weights of the whole model."""
         return ()
 
+    def checkpoint_table(self, table: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The config's ``model`` as a checkpoint stores it, by default ``table`` itself.
+
+        A model that reads its sizes from a file that a checkpoint does without adds them here.
+        """
+        return table
+
     def fsdp_units(self) -> Sequence[Any]:
         """The blocks that are sharded, recomputed and compiled one by one; none by default.
 

@@ -152,8 +152,8 @@ def load(source: PolicySource) -> LocalPolicy:
     if source.policy == UNTRAINED:
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            model = model_of(Checkpoint.open(source.ckpt_path)).to(policy.device).eval()
-        policy.model = ready(model, precision, quantization)
+            model = model_of(Checkpoint.open(source.ckpt_path), untrained=True)
+        policy.model = ready(model.to(policy.device).eval(), precision, quantization)
     policy.batch_size = source.batch_size
     return policy
 

@@ -20,11 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.build import build_operator_from_cfg, build_vla_from_cfg
+from fluxvla_core.build import build_vla_from_cfg, robot_of
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import with_history
-from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import Transform
 from fluxvla_core.data.example import unit_statistics
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
@@ -136,7 +135,7 @@ def untrained_policy(
     """The policy that a config trains, with random weights and statistics of 0 and 1.
 
     Args:
-        embodiment: the robot; by default that of ``inference.operator``.
+        embodiment: the robot; by default that of the config, see ``robot_of``.
 
     Raises:
         ConfigError: the config lacks the model, its dataset's transforms, or the robot; or the
@@ -144,7 +143,12 @@ def untrained_policy(
     """
     if "model" not in config:
         raise ConfigError("the config has no section 'model'")
-    robot = embodiment or _robot_of(config)
+    robot = embodiment or robot_of(config)
+    if robot is None:
+        raise UsageError(
+            "the config has no inference.operator, so the robot of its actions is unknown",
+            next="--embodiment FILE",
+        )
     dataset = first_dataset(config.get("train_dataloader", {}).get("dataset", {}))
     missing = [key for key in ("img_keys", "transforms") if key not in dataset]
     if missing:
@@ -306,21 +310,6 @@ def _quickest(work: Callable[[], Any], device: str) -> float:
             torch.cuda.synchronize()
         best = min(best, time.perf_counter() - begun)
     return best
-
-
-def _robot_of(config: Mapping[str, Any]) -> EmbodimentSpec:
-    section = config.get("inference", {})
-    table = section.get("operator") if isinstance(section, Mapping) else None
-    if table is None:
-        raise UsageError(
-            "the config has no inference.operator, so the robot of its actions is unknown",
-            next="--embodiment FILE",
-        )
-    operator = Operator.adapt(build_operator_from_cfg(table))
-    try:
-        return operator.embodiment
-    finally:
-        operator.close()
 
 
 def _forget_memory(device: str) -> None:

@@ -187,7 +187,7 @@ def _model(checkpoint: Checkpoint, device: str) -> Any:
 
 
 def _try(prepare: Any, denormalize: Any, robot: EmbodimentSpec, horizon: int, where: str) -> None:
-    """Try them before weights are read; the runner reports cameras that the robot lacks."""
+    """Try them before weights are read; who drives the robot reports cameras that it lacks."""
     sizes = {camera.name: (camera.height, camera.width) for camera in robot.cameras}
     keys = getattr(prepare, "img_keys", ())
     if all(camera_name(key) in sizes for key in keys):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -146,6 +147,27 @@ def has_values(tensor: Tensor) -> bool:
 def built_without_memory() -> bool:
     """Whether models are built on the meta device now: then there are no weights to load."""
     return torch.get_default_device().type == "meta"
+
+
+_FOLLOW: ContextVar[bool] = ContextVar("weights_follow", default=False)
+
+
+def weights_follow() -> bool:
+    """Whether the model that is built now gets a checkpoint's weights, or is without memory.
+
+    Weights that it would start a training from need not be read then, nor be there.
+    """
+    return _FOLLOW.get() or built_without_memory()
+
+
+@contextmanager
+def before_its_weights() -> Iterator[None]:
+    """Inside, :func:`weights_follow` is True: all weights are loaded into what is built here."""
+    token = _FOLLOW.set(True)
+    try:
+        yield
+    finally:
+        _FOLLOW.reset(token)
 
 
 # -- from a batch to a loss ------------------------------------------------------------------

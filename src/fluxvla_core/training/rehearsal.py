@@ -7,7 +7,6 @@ What cannot be known is noted; nothing here ends the dry run.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -17,11 +16,10 @@ from torch import Tensor, nn
 
 from fluxvla_core.build import (
     RunContext,
-    build_operator_from_cfg,
     build_runner_from_cfg,
     build_vla_from_cfg,
+    robot_of,
 )
-from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.example import Example, Refused, example
 from fluxvla_core.errors import ConfigError, FluxError
@@ -51,7 +49,7 @@ class Rehearsal:
     """Results of a dry run.
 
     Args:
-        robot: of ``inference.operator``.
+        robot: that the policy acts on; see ``robot_of``.
         data: a sample.
         batch: the collator's: name -> shape and dtype.
         model: name of its class.
@@ -90,10 +88,7 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
     """
     rehearsal = Rehearsal()
     notes = rehearsal.notes
-    section = context.config.get("inference")
-    operator = section.get("operator") if isinstance(section, Mapping) else None
-    if operator is not None:
-        rehearsal.robot = _tried(notes, "the robot is not known", lambda: _robot(operator))
+    rehearsal.robot = _tried(notes, "the robot is not known", lambda: robot_of(context.config))
     what = "the model cannot be built without memory"
     model = _tried(notes, what, lambda: on_meta(context))
     runner = _runner(context, notes)
@@ -216,11 +211,6 @@ def _tried(notes: list[str], what: str, make: Callable[[], T]) -> T | None:
     except Exception as error:  # noqa: BLE001 - classes of plugins, and peft's
         notes.append(f"{what}: {_one_line(error)}")
         return None
-
-
-def _robot(table: Any) -> EmbodimentSpec:
-    with closing(Operator.adapt(build_operator_from_cfg(table))) as operator:
-        return operator.embodiment
 
 
 def _with_adapters(model: nn.Module, options: LoraOptions, context: RunContext) -> nn.Module:

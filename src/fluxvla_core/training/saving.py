@@ -158,10 +158,13 @@ def run_documents(context: RunContext, dataset: Any, model: nn.Module) -> dict[s
     the model's ``action_shape``, else the dataset's ``action_window_size``; null where unknown.
     """
     described = Dataset.adapt(dataset)
-    shape = VLA.adapt(model).action_shape
-    horizon = shape[0] if shape else described.action_window_size
+    vla = VLA.adapt(model)
+    horizon = vla.action_shape[0] if vla.action_shape else described.action_window_size
     rate = described.fps
-    config = {"format": FORMAT, "config": context.config, "origins": dict(context.origins)}
+    tree = dict(context.config)
+    if isinstance(tree.get("model"), Mapping):
+        tree["model"] = vla.checkpoint_table(tree["model"])
+    config = {"format": FORMAT, "config": tree, "origins": dict(context.origins)}
     documents: dict[str, dict[str, Any]] = {
         ckpt.CONFIG: described_as_json(config),
         ckpt.ENVIRONMENT: environment(),

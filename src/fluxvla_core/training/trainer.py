@@ -17,6 +17,7 @@ from fluxvla_core.checkpoints.checkpoint import name_best
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.loader import IDS, loader_source, make_loader, to_device
 from fluxvla_core.data.sampler import StepSampler, episode_shards
+from fluxvla_core.errors import located
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.training.cost import GB, peak_bytes
 from fluxvla_core.training.model import ForwardArguments, check_observations, trainable
@@ -60,6 +61,8 @@ class Trainer:
         """Give the runner what its steps and its checkpoints need, and the dataset its seed."""
         runner = self._runner
         options, world, context = runner.options, runner.world, runner.context
+        self._data_where = context.where("train_dataloader.dataset")
+        self._model_where = context.where("model")
         if not world.is_rank0:
             runner.hooks = HookCaller(context)
         runner.dataset = dataset
@@ -165,9 +168,10 @@ class Trainer:
         losses, ids, each, waited = [], [], [], 0.0
         for part in range(parts):
             asked = time.perf_counter()
-            batch = to_device(next(self._batches), runner.world.device)
+            with located(self._data_where):
+                batch = to_device(next(self._batches), runner.world.device)
             waited += time.perf_counter() - asked
-            with runner.sync_gradients(last=part == parts - 1):
+            with runner.sync_gradients(last=part == parts - 1), located(self._model_where):
                 loss = runner._training_step(batch)
                 runner.backward(loss / parts if parts > 1 else loss)
             losses.append(loss.detach())
@@ -236,7 +240,8 @@ class Trainer:
     def _peek_first_batch(self) -> None:
         """Show the first batch to the FLOP counter and to the strategy, before the first step."""
         runner = self._runner
-        first = next(self._batches)
+        with located(self._data_where):
+            first = next(self._batches)
         self._batches = chain([first], self._batches)
         shown = to_device(first, runner.world.device)
         if runner.flops is not None and runner.forward_arguments is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from fluxvla_core.data.transforms.pipeline import redirected
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, run_on_rank0
-from fluxvla_core.training.model import frozen_sources, set_frozen_source
+from fluxvla_core.training.model import before_its_weights, frozen_sources, set_frozen_source
 
 
 @dataclass(frozen=True)
@@ -162,10 +163,14 @@ def _other_frozen(
     )
 
 
-def model_of(checkpoint: Checkpoint) -> nn.Module:
+def model_of(checkpoint: Checkpoint, untrained: bool = False) -> nn.Module:
     """The model that a checkpoint's config describes, without the checkpoint's weights.
 
     A tokenizer of the model's own is that of the checkpoint's processors.
+
+    Args:
+        untrained: with the weights that its training began with; else those of the checkpoint are
+            loaded next, and none is read here.
 
     Raises:
         CheckpointError: the config has no section ``model``.
@@ -177,7 +182,8 @@ def model_of(checkpoint: Checkpoint) -> nn.Module:
             "the checkpoint's config has no section 'model'", where=str(checkpoint.path)
         )
     (table,) = redirected([config["model"]], checkpoint.processors)
-    built: nn.Module = build_vla_from_cfg(table)
+    with nullcontext() if untrained else before_its_weights():
+        built: nn.Module = build_vla_from_cfg(table)
     return built
 
 

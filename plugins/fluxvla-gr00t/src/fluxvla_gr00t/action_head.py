@@ -1,7 +1,7 @@
 """GR00T's action head: flow matching by a diffusion transformer, for N1.5 and N1.7.
 
 The path is ``x_t = (1 - t) * noise + t * actions``; the network answers with the velocity
-``actions - noise``. It is told the time in thousandths. Bjorck et al. 2025, "GR00T N1: An Open
+``actions - noise``. Its time steps count thousandths. Bjorck et al. 2025, "GR00T N1: An Open
 Foundation Model for Generalist Humanoid Robots" (arXiv 2503.14734).
 """
 

@@ -19,7 +19,7 @@ class GR00T(VLA, nn.Module):
     """Images, instruction and joint state in, action chunk out: GR00T N1.5 and N1.7.
 
     N1.5 is ``EagleBackbone`` and ``GR00TActionHead`` as they are; N1.7 is ``Qwen3VLBackbone`` and
-    a ``GR00TActionHead`` with N1.7's numbers (configs/gr00t has both).
+    a ``GR00TActionHead`` with N1.7's numbers (``configs/gr00t_n15_*.py``, ``gr00t_n17_*.py``).
 
     Args:
         vlm_backbone: table or module; images and tokens -> ``Context``.
@@ -159,6 +159,7 @@ class GR00T(VLA, nn.Module):
         if bool(((ids < 0) | (ids >= known)).any()):
             raise ConfigError(
                 f"embodiment_ids {ids.tolist()} are not all in 0..{known - 1}, the embodiments "
-                "that the head has layers for"
+                "that the head has layers for",
+                next="--set train_dataloader.dataset.embodiment_id=N: the number of the robot",
             )
         return ids.long()

@@ -42,8 +42,8 @@ def imported(folder, robot, *more):
     described = folder.parent / "robot.json"
     described.write_text(json.dumps(robot.to_dict()))
     out = folder.parent / "ours"
-    told = ["--embodiment", str(described), "--rate", "10", *more]
-    assert main(["import-checkpoint", str(folder), str(out), *told]) == 0
+    options = ["--embodiment", str(described), "--rate", "10", *more]
+    assert main(["import-checkpoint", str(folder), str(out), *options]) == 0
     return load_policy(out)
 
 

@@ -71,8 +71,8 @@ def test_a_robot(place, capfd):
 
 def test_a_robot_by_a_policy_that_looks_at_two_observations(place, capfd):
     """It is asked at each step, and the arm waits for it."""
-    told = ["--set", "inference.policy.path=diffusion", "--set", "inference.execute_horizon=1"]
-    assert main([*readmes("inference"), *told]) == 0
+    options = ["--set", "inference.policy.path=diffusion", "--set", "inference.execute_horizon=1"]
+    assert main([*readmes("inference"), *options]) == 0
     said = capfd.readouterr()
     assert re.search(r"steps: +30", said.out + said.err), said.out + said.err
 
@@ -82,8 +82,8 @@ def test_a_robot_needs_to_know_robot_and_rate(place, capfd):
         text = (place / "acting.py").read_text()
         lines = [line for line in text.splitlines() if not line.strip().startswith(f"{key}=")]
         (place / "less.py").write_text("\n".join(lines))
-        told = ["run", "--config", "less.py", "--section", "inference", "--task", "1"]
-        assert main([*told, "--work-dir", "work"]) == 2
+        options = ["run", "--config", "less.py", "--section", "inference", "--task", "1"]
+        assert main([*options, "--work-dir", "work"]) == 2
         assert words in capfd.readouterr().err
 
 
@@ -91,8 +91,8 @@ def test_another_robot_is_refused_before_the_episode(place, capfd):
     robot = json.loads((place / "data" / "meta" / "fluxvla_embodiment.json").read_text())
     robot["joints"][0]["name"] = "torso"
     (place / "other.json").write_text(json.dumps(robot))
-    told = ["--set", "eval.policy.embodiment=other.json"]
-    assert main([*readmes("eval"), *told]) == 2
+    options = ["--set", "eval.policy.embodiment=other.json"]
+    assert main([*readmes("eval"), *options]) == 2
     err = capfd.readouterr().err
     assert "do not fit together" in err
     assert "torso" in err

@@ -74,6 +74,11 @@ def libero_spec(cameras: Sequence[Camera] | None = None) -> EmbodimentSpec:
     )
 
 
+def dataset_spec() -> EmbodimentSpec:
+    """:func:`libero_spec` with each camera under every name that datasets give it."""
+    return libero_spec([Camera(name, IMAGE_SIZE, IMAGE_SIZE) for name in CAMERAS])
+
+
 def _delta(name: str, kind: str) -> Joint:
     ends = (OPEN, CLOSED) if kind == "gripper" else (None, None)
     return Joint(name, "normalized", -1.0, 1.0, 40.0, 1600.0, kind, *ends)

@@ -11,7 +11,7 @@ from fluxvla_mujoco import RENDERS
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import EvalRunner
 from fluxvla_core.operators import RunContext
-from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS
+from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS, dataset_spec
 from fluxvla_libero.environment import FLUXVLA, OPENVLA
 from fluxvla_libero.suites import NUM_STEPS_WAIT, check_suite, choose_tasks
 
@@ -57,6 +57,8 @@ class LiberoEvalRunner(EvalRunner):
     """
 
     api: ClassVar[str] = "1.0"
+    robot_spec = staticmethod(dataset_spec)
+    """The robot that both runners are for."""
 
     def __init__(
         self,

@@ -30,7 +30,7 @@ from fluxvla_core.operators import (
     tasks,
 )
 from fluxvla_core.results import episode_log
-from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS
+from fluxvla_libero.embodiment import CAMERAS, CONTROL_HZ, SCENE_CAMERAS, dataset_spec
 from fluxvla_libero.environment import LiberoEnvironment
 from fluxvla_libero.eval_runner import TRIALS
 from fluxvla_libero.suites import (
@@ -78,6 +78,8 @@ class LiberoInferenceRunner:
     """
 
     api: ClassVar[str] = "1.0"
+    robot_spec = staticmethod(dataset_spec)
+    """The robot that both runners are for."""
 
     def __init__(
         self,

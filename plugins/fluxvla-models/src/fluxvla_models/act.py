@@ -34,7 +34,7 @@ class ACT(VLA, nn.Module):
             from; nothing is fetched.
         dim_model, n_heads, dim_feedforward, feedforward_activation, pre_norm, dropout,
         n_encoder_layers, n_decoder_layers: of the transformer. The authors' code uses one decoder
-            layer, whatever it is asked for.
+            layer, whatever its setting.
         use_vae, latent_dim, n_vae_encoder_layers: of the encoder of chunks.
         kl_weight: of the divergence from the prior in the loss.
         masked_mean: the loss is a mean over the actions of the episode only, as in LeRobot from

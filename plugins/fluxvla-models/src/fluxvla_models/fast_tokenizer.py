@@ -127,7 +127,7 @@ def fit(
     Args:
         chunks: each ``(T, D)``, of a training set as its transforms give it.
         folder: is made; ``model_path`` of a :class:`FastTokenizer`.
-        vocab_size: tokens, of which some 324 are single characters or bytes.
+        vocab_size: tokens; some 324 are single characters or bytes.
         scale: the larger, the finer the rounding and the more tokens.
 
     Raises:

@@ -238,9 +238,9 @@ def image_features(config: Mapping[str, Any], where: str) -> tuple[list[str], tu
     found = {name: shape for name, (kind, shape) in features.items() if kind == "VISUAL"}
     sizes = set(found.values())
     if len(sizes) != 1 or any(len(shape) != 3 or shape[0] != 3 for shape in sizes):
-        told = ", ".join(f"{name} {shape}" for name, shape in found.items()) or "none"
+        sizes = ", ".join(f"{name} {shape}" for name, shape in found.items()) or "none"
         raise CheckpointError(
-            f"cameras with images of one size are expected, the policy has {told}", where=where
+            f"cameras with images of one size are expected, the policy has {sizes}", where=where
         )
     other = [name for name, (kind, _) in features.items() if kind not in ("VISUAL", "STATE")]
     if other:

@@ -161,6 +161,16 @@ class LlavaVLA(VLA, nn.Module):
         """``(T, D)`` of a chunk."""
         return self.vla_head.horizon, self.vla_head.action_dim
 
+    def checkpoint_table(self, table: Mapping[str, Any]) -> Mapping[str, Any]:
+        """``table`` with the sizes of pretrained parts, whose folders a checkpoint does without."""
+        parts = {name: getattr(self.get_submodule(name), "sizes", None) for name in self._parts}
+        sized = {
+            name: {**table[name], "sizes": sizes}
+            for name, sizes in parts.items()
+            if sizes is not None and isinstance(table.get(name), Mapping)
+        }
+        return {**table, **sized}
+
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
         units: list[nn.Module] = []

@@ -1,7 +1,9 @@
 """Vision and language models of transformers as backbones, built from a folder's ``config.json``.
 
 Nothing is fetched, and no code that comes with weights is run. A folder is a path, or
-``package:<module>/<folder>`` for one that an installed package carries.
+``package:<module>/<folder>`` for one that an installed package carries. ``sizes`` are values of its
+``config.json``: where they are given, a dry run, or a checkpoint that brings all weights, needs no
+folder.
 """
 
 from __future__ import annotations
@@ -14,8 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import built_without_memory
 from fluxvla_core.models import model_folder as checked_folder
+from fluxvla_core.models import weights_follow
+
+Sizes = Mapping[str, Any]
+_NO_SIZES = ("architectures", "dtype", "transformers_version")
+_REFUSED = ("auto_map", "quantization_config", "attn_implementation", "experts_implementation")
 
 
 class SigLIPBackbone(nn.Module):
@@ -26,18 +32,25 @@ class SigLIPBackbone(nn.Module):
         num_cameras: images per sample, all seen by the same encoder.
         pretrained: load the folder's weights; else they are drawn anew, which is right where a
             checkpoint overwrites them.
+        sizes: values of the folder's ``config.json``, with its ``model_type``. They are compared
+            with it where it is there. Checkpoints hold them.
 
     Raises:
-        ConfigError: there is no such folder, it wants code of its own run, is of another kind, or
-            lacks weights.
+        ConfigError: there is no such folder, it wants code of its own run, is of another kind or of
+            other ``sizes``, or lacks weights.
     """
 
-    def __init__(self, model_folder: str, num_cameras: int = 1, pretrained: bool = True) -> None:
+    def __init__(
+        self,
+        model_folder: str,
+        num_cameras: int = 1,
+        pretrained: bool = True,
+        sizes: Sizes | None = None,
+    ) -> None:
         super().__init__()
-        folder = checked_folder(model_folder)
-        config = read_config(folder, ("siglip", "siglip_vision_model"))
-        if config.model_type == "siglip":
-            config = config.vision_config
+        kinds = ("siglip_vision_model", "siglip")
+        folder, config = described(model_folder, kinds, pretrained, sizes, "vision_config")
+        self.sizes = sizes_of(config)
         config.vision_use_head = False  # it pools all patches into one feature
         from transformers import SiglipVisionModel
 
@@ -66,24 +79,28 @@ class LanguageBackbone(nn.Module):
     """A decoder-only language model without the layer that predicts words.
 
     Args:
-        model_folder, pretrained: as of ``SigLIPBackbone``.
+        model_folder, pretrained, sizes: as of ``SigLIPBackbone``.
         num_layers: use the first ones only; all by default.
     """
 
     kinds: ClassVar[Sequence[str]] = ()
 
     def __init__(
-        self, model_folder: str, pretrained: bool = True, num_layers: int | None = None
+        self,
+        model_folder: str,
+        pretrained: bool = True,
+        num_layers: int | None = None,
+        sizes: Sizes | None = None,
     ) -> None:
         super().__init__()
-        folder = checked_folder(model_folder)
-        config = read_config(folder, self.kinds)
+        folder, config = described(model_folder, self.kinds, pretrained, sizes)
+        self.sizes = sizes_of(config)
         if num_layers is not None:
             if not 1 <= num_layers <= config.num_hidden_layers:
                 raise ConfigError(
                     f"num_layers {num_layers} is not between 1 and the model's "
                     f"{config.num_hidden_layers}",
-                    where=str(folder),
+                    where=model_folder,
                 )
             config.num_hidden_layers = num_layers
             if config.to_dict().get("layer_types"):
@@ -138,13 +155,19 @@ class PaliGemmaBackbone(nn.Module):
     """PaliGemma (Beyer et al. 2024): image and text tokens in one model, with full attention.
 
     Args:
-        model_folder, num_cameras, pretrained: as of ``SigLIPBackbone``.
+        model_folder, num_cameras, pretrained, sizes: as of ``SigLIPBackbone``.
     """
 
-    def __init__(self, model_folder: str, num_cameras: int = 1, pretrained: bool = True) -> None:
+    def __init__(
+        self,
+        model_folder: str,
+        num_cameras: int = 1,
+        pretrained: bool = True,
+        sizes: Sizes | None = None,
+    ) -> None:
         super().__init__()
-        folder = checked_folder(model_folder)
-        config = read_config(folder, ("paligemma",))
+        folder, config = described(model_folder, ("paligemma",), pretrained, sizes)
+        self.sizes = sizes_of(config)
         config.vision_config.vision_use_head = False
         from transformers import AutoModel
 
@@ -183,6 +206,105 @@ class PaliGemmaBackbone(nn.Module):
         return layers_of(self.model)
 
 
+def described(
+    model_folder: str,
+    kinds: Sequence[str],
+    pretrained: bool,
+    sizes: Sizes | None,
+    part: str | None = None,
+) -> tuple[Path | None, Any]:
+    """The folder and the transformers configuration in it; None and that of ``sizes``, where the
+    folder is absent and its weights are not needed.
+
+    Args:
+        part: the configuration inside that one that is meant, where there is such a one.
+
+    Raises:
+        ConfigError: as of ``SigLIPBackbone``.
+    """
+    try:
+        folder = checked_folder(model_folder)
+    except ConfigError as error:
+        absent = not Path(model_folder).expanduser().exists()
+        if sizes is not None and absent and (weights_follow() or not pretrained):
+            return None, config_of(sizes, kinds[:1])
+        if absent and error.next is not None:
+            error.next += "; for a dry run without it: sizes=dict(...), values of its config.json"
+        raise
+    config = read_config(folder, kinds)
+    config = config if part is None else getattr(config, part, config)
+    if sizes is not None:
+        config_of(sizes, kinds[:1])
+        _compare(sizes, config, str(folder / "config.json"))
+    return folder, config
+
+
+def config_of(sizes: Sizes, kinds: Sequence[str]) -> Any:
+    """The transformers configuration that has ``sizes``.
+
+    Raises:
+        ConfigError: ``sizes`` lack a ``model_type`` of ``kinds``, or have a setting that such a
+            model does not have.
+    """
+    from transformers import AutoConfig
+
+    kind = sizes.get("model_type")
+    if kind not in kinds:
+        raise ConfigError(
+            f"sizes.model_type is {kind!r}; {' or '.join(kinds)} is expected",
+            next="take it from the model's config.json",
+        )
+    _check_names(sizes, AutoConfig.for_model(kind), "sizes")
+    try:
+        return AutoConfig.for_model(**_plain(sizes))
+    except Exception as error:  # whatever wrong values make transformers raise
+        raise ConfigError(
+            f"no {kind} can be built of its sizes: {type(error).__name__}: {error}"
+        ) from error
+
+
+def sizes_of(config: Any) -> dict[str, Any]:
+    """The ``sizes`` that make an equal model: values that are not transformers' defaults."""
+    found = {k: v for k, v in config.to_diff_dict().items() if k not in _NO_SIZES and k[0] != "_"}
+    for name, part in found.items():
+        if isinstance(part, dict) and name.endswith("_config"):
+            found[name] = sizes_of(getattr(config, name))
+    return {**found, "model_type": config.model_type}
+
+
+def _check_names(sizes: Sizes, config: Any, at: str) -> None:
+    known = {*config.to_dict(), "head_dim"}  # not a field of all, and read by all
+    for name, value in sizes.items():
+        if name in _REFUSED or name.startswith("_") or name not in known:
+            raise ConfigError(
+                f"{at}.{name}: a {config.model_type} has no such setting",
+                next="take the names from the model's config.json",
+            )
+        if isinstance(value, Mapping) and name.endswith("_config"):
+            _check_names(value, getattr(config, name), f"{at}.{name}")
+
+
+def _compare(sizes: Sizes, config: Any, where: str, at: str = "sizes") -> None:
+    """Compare ``sizes`` with the ``config`` that was read from ``where``."""
+    for name, value in sizes.items():
+        there = getattr(config, name, None)
+        if isinstance(value, Mapping) and hasattr(there, "to_dict"):
+            _compare(value, there, where, f"{at}.{name}")
+        elif name != "model_type" and _plain(value) != _plain(there):
+            raise ConfigError(
+                f"{at}.{name} is {value!r}, config.json has {there!r}",
+                where=where,
+                cause="the folder is of another model, or sizes are",
+            )
+
+
+def _plain(value: Any) -> Any:
+    """Tables and lists of a config, which may be frozen, as dicts and lists."""
+    if isinstance(value, Mapping):
+        return {name: _plain(inner) for name, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
 def read_config(folder: Path, kinds: Sequence[str]) -> Any:
     """The transformers configuration in ``folder``.
 
@@ -207,14 +329,14 @@ def read_config(folder: Path, kinds: Sequence[str]) -> Any:
     return config
 
 
-def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
-    """A transformers model in float32, with the folder's weights or, if not ``pretrained``, new
-    ones.
+def built(kind: Any, folder: Path | None, config: Any, pretrained: bool) -> nn.Module:
+    """A transformers model in float32, with the folder's weights or, if not ``pretrained`` or if
+    others follow, new ones.
 
     Raises:
         ConfigError: the folder has no weights, or not all of them.
     """
-    if not pretrained or built_without_memory():
+    if folder is None or not pretrained or weights_follow():
         if hasattr(kind, "from_config"):
             return kind.from_config(config, trust_remote_code=False)
         return kind(config)
@@ -232,7 +354,7 @@ def built(kind: Any, folder: Path, config: Any, pretrained: bool) -> nn.Module:
             use_safetensors=True,
             trust_remote_code=False,
             output_loading_info=True,
-            ignore_mismatched_sizes=True,  # they are told below
+            ignore_mismatched_sizes=True,  # they are reported below
         )
     except Exception as error:  # whatever damaged files make transformers raise
         raise ConfigError(

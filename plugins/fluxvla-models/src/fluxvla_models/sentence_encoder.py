@@ -66,7 +66,7 @@ class SentenceEncoder(nn.Module):
 
     def forward(self, tokens: Tensor, masks: Tensor) -> Tensor:
         """``(B, L)`` int64 tokens and bool masks -> ``(B, out_dim)`` float32."""
-        if not has_values(tokens):  # which instructions are known cannot be told
+        if not has_values(tokens):  # without values no instruction can be looked up
             return tokens.new_empty((len(tokens), self.out_dim), dtype=torch.float32)
         rows = tokens.masked_fill(~masks, 0).cpu()
         vectors = [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fluxvla_smolvla.images import SmolVLAImages
-from fluxvla_smolvla.keys import published_names
+from fluxvla_smolvla.lerobot_files import published_names
 from fluxvla_smolvla.model import SmolVLA
 from fluxvla_smolvla.normalization import SmolVLANormalize
 

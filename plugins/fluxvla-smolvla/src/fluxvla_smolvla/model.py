@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from fluxvla_core.errors import ConfigError, DataError
 from fluxvla_core.models import VLA
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
-from fluxvla_smolvla.loss import masked_mean
 from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
 from fluxvla_smolvla.transformer import ContextLayer, KVCache, Prefix, RMSNorm, Rotation
 from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad
@@ -217,7 +216,7 @@ class SmolVLA(VLA, nn.Module):
         if given is not None:
             errors = errors * ~given[..., None]
         errors = errors[..., : self.ori_action_dim]
-        loss, each = masked_mean(errors, action_masks, self.loss_mean)
+        loss, each = _masked_mean(errors, action_masks, self.loss_mean)
         return {"loss": loss, "sample_losses": each.detach()}
 
     def predict_action(
@@ -407,3 +406,19 @@ def _expect(what: str, found: Any, names: str, expected: tuple[int, ...]) -> Non
             next="the transforms pad and cut: compare their widths and action_window_size with "
             "the model's",
         )
+
+
+def _masked_mean(errors: Tensor, masks: Tensor, over: str) -> tuple[Tensor, Tensor]:
+    """The loss of a batch, and that of each sample, ``(B,)``.
+
+    Args:
+        errors: ``(B, K, T, D)``.
+        masks: ``(B, T)``, 0 beyond the end of an episode.
+        over: ``valid``: the mean over steps inside episodes; ``all``: the others count as 0, so
+            that the gradient does not depend on which samples share a batch.
+    """
+    kept = errors * masks[:, None, :, None]
+    if over == "all":
+        return kept.mean(), kept.flatten(1).mean(1)
+    each = masks.sum(1).to(errors.dtype) * errors.shape[1] * errors.shape[3]
+    return kept.sum() / each.sum().clamp_min(1), kept.flatten(1).sum(1) / each.clamp_min(1)

@@ -105,8 +105,8 @@ def formats() -> tuple[list[CheckpointFormat], list[PluginError]]:
 
 @contextmanager
 def telling_families(table: Any, model: object) -> Iterator[None]:
-    """Let errors about weights say that the checkpoint's ``model`` table is of another class than
-    ``model``, if it is."""
+    """Let errors about weights say in what the checkpoint's ``model`` table is another than
+    ``model``: its class, or numbers by which it was made."""
     try:
         yield
     except CheckpointError as error:
@@ -115,7 +115,26 @@ def telling_families(table: Any, model: object) -> Iterator[None]:
         if kind is not None and theirs != ours:
             error.cause = f"the checkpoint is of {theirs}, the config's model is {ours}"
             error.next = f"name a checkpoint of {ours}, or let the config's model be {theirs}"
+        elif differ := _other_numbers(table, model):
+            listed = (
+                f"{key} {there}, the config's {here}" for key, (there, here) in differ.items()
+            )
+            error.cause = f"the checkpoint's model has {'; '.join(listed)}"
+            words = (f"--set model.{key}={there}" for key, (there, _) in differ.items())
+            error.next = f"{' '.join(words)}, and data and transforms that fit; or other weights"
         raise
+
+
+def _other_numbers(table: Any, model: object) -> dict[str, tuple[int, int]]:
+    """Whole numbers of a ``model`` table that ``model`` has under the same names, with others."""
+    if not isinstance(table, Mapping):
+        return {}
+    pairs = ((key, there, getattr(model, key, None)) for key, there in table.items())
+    return {
+        key: (there, here)
+        for key, there, here in pairs
+        if type(there) is int and type(here) is int and there != here
+    }
 
 
 def unknown_format(

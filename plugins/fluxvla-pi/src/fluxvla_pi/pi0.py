@@ -15,7 +15,7 @@ from fluxvla_pi.flow_matching import PiFlowMatching, Suffix, time_features
 
 
 class PI0FlowMatching(PiFlowMatching):
-    """PI0.
+    """PI0: the state is a token, and the time joins every action.
 
     Args:
         max_state_dim: width of (padded) states.

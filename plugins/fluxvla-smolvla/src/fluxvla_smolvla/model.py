@@ -15,9 +15,10 @@ from typing import Any
 import torch
 from fluxvla_models.guidance import Guide
 from fluxvla_models.velocity import sample
+from fluxvla_models.widths import check_actions, check_states
 from torch import Tensor, nn
 
-from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
 from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
@@ -188,8 +189,8 @@ class SmolVLA(VLA, nn.Module):
                 and their errors count as 0, for ``prefix_conditioning``.
 
         Raises:
-            DataError: an input of a width that the model does not have.
-            ConfigError: ``prefix_len`` without ``prefix_conditioning``, or the reverse.
+            ConfigError: an input of a width that the model does not have; ``prefix_len`` without
+                ``prefix_conditioning``, or the reverse.
         """
         if self.prefix_conditioning != (prefix_len is not None):
             raise ConfigError(
@@ -198,9 +199,9 @@ class SmolVLA(VLA, nn.Module):
                 next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
                 "prefix_len among the collator's keys, belong to prefix_conditioning=True",
             )
-        repeats, shape = noise.shape[1], self.action_shape
-        _expect("actions", actions.shape[1:], "n_action_steps and max_action_dim", shape)
-        _expect("noise", noise.shape[2:], "n_action_steps and max_action_dim", shape)
+        repeats = noise.shape[1]
+        check_actions("SmolVLA", tuple(actions.shape[1:]), self.action_shape)
+        check_actions("SmolVLA", tuple(noise.shape[2:]), self.action_shape, "noise")
         cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
         cache = cache.repeat_interleave(repeats)
         t, given = 1.0 - time, None
@@ -242,9 +243,9 @@ class SmolVLA(VLA, nn.Module):
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
 
         Raises:
-            DataError: an input of a width that the model does not have.
+            ConfigError: an input of a width that the model does not have.
         """
-        _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
+        check_actions("SmolVLA", tuple(noise.shape[1:]), self.action_shape, "noise")
         own = None if self.prefix_conditioning else self.ori_action_dim
         guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
         if guide is None:
@@ -274,7 +275,7 @@ class SmolVLA(VLA, nn.Module):
         """What the steps need of an observation, arguments as of ``forward``: ``Expert.observe``.
 
         Raises:
-            DataError: an input of a width that the model does not have.
+            ConfigError: an input of a width that the model does not have.
         """
         cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
         return self.expert.observe(cache, self.n_action_steps)
@@ -283,7 +284,7 @@ class SmolVLA(VLA, nn.Module):
         self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
     ) -> Tensor:
         """All steps by Euler's method: ``noise`` ``(B, T, D)`` -> actions ``(B, T, D)``."""
-        _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
+        check_actions("SmolVLA", tuple(noise.shape[1:]), self.action_shape, "noise")
         x = noise
         for step in range(self.num_steps):
             tokens = self.embed_actions.embed_at_time(x, tables["times"][step])
@@ -322,11 +323,11 @@ class SmolVLA(VLA, nn.Module):
         """The KV cache of images, instruction and state."""
         cameras, rest = divmod(images.shape[1], 3)
         if rest or cameras != img_masks.shape[1]:
-            raise DataError(
+            raise ConfigError(
                 f"SmolVLA: images have {images.shape[1]} channels, img_masks {img_masks.shape[1]} "
                 "cameras; 3 channels each are expected"
             )
-        _expect("states", states.shape[1:], "max_state_dim", (self.max_state_dim,))
+        check_states("SmolVLA", "max_state_dim", states, self.max_state_dim)
         features = self._encode_images(images.unflatten(1, (cameras, 3)).flatten(0, 1))
         features = features.unflatten(0, (-1, cameras))
         image_mask = img_masks.bool()[..., None].expand(-1, -1, features.shape[2])
@@ -395,16 +396,6 @@ def _check_counts(experts: int, layers: int, **counts: int) -> None:
         raise ConfigError(
             f"SmolVLA: num_expert_layers {experts} does not divide the language model's {layers} "
             "layers (text.layers)"
-        )
-
-
-def _expect(what: str, found: Any, names: str, expected: tuple[int, ...]) -> None:
-    if tuple(found) != expected:
-        raise DataError(
-            f"SmolVLA: {what} of a sample have shape {tuple(found)}, {expected} ({names}) is "
-            "expected",
-            next="the transforms pad and cut: compare their widths and action_window_size with "
-            "the model's",
         )
 
 

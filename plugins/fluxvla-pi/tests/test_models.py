@@ -341,9 +341,7 @@ def test_sizes_that_do_not_fit_are_refused(settings, words):
 
 def test_chunks_and_images_of_another_size_are_refused(model):
     batch = training_batch()
-    with pytest.raises(
-        ConfigError, match=r"actions are \(4, 8\) .* chunks \(5, 8\)"
-    ):
+    with pytest.raises(ConfigError, match=r"actions are \(4, 8\) .* chunks \(5, 8\)"):
         model(**{**batch, "actions": batch["actions"][:, :4]})
     with pytest.raises(ConfigError, match=r"noise are \(5, 7\)"):
         model.predict_action(**{**acting_batch(), "noise": torch.zeros(BATCH, 5, 7)})

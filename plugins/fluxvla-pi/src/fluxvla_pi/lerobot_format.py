@@ -362,7 +362,8 @@ def _check_sizes(checkpoint: ForeignCheckpoint) -> None:
     if sizes != _VARIANTS or model.get("vocab_size", 257152) != VOCABULARY:
         raise CheckpointError(
             f"LeRobot's policies have the sizes {', '.join(_VARIANTS.values())}; this one has "
-            f"{', '.join(map(str, sizes.values()))}"
+            f"{', '.join(map(str, sizes.values()))}",
+            next="--format openpi writes any size",
         )
 
 

@@ -176,9 +176,14 @@ def _statistics(file: Path, family: str) -> tuple[dict[str, Any], bool]:
     for theirs, ours in ENTRIES.items():
         tables = content.get("norm_stats")
         table = tables.get(theirs) if isinstance(tables, Mapping) else None
-        if not isinstance(table, Mapping) or any(table.get(name) is None for name in wanted):
+        table = table if isinstance(table, Mapping) else {}
+        lacks = [name for name in wanted if table.get(name) is None]
+        if lacks:
             raise CheckpointError(
-                f"norm_stats: {theirs!r} has not all of {', '.join(wanted)}", where=where
+                f"norm_stats: {theirs!r} has no {', '.join(lacks)}; it has "
+                f"{', '.join(sorted(table)) or 'nothing'}",
+                where=where,
+                next="compute the statistics again with openpi's scripts/compute_norm_stats.py",
             )
         given = {n: table[n] for n in ("mean", "std", "q01", "q99") if table.get(n) is not None}
         try:

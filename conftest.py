@@ -32,7 +32,7 @@ from pathlib import Path  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-from tools import skipped, stages  # noqa: E402
+from tools import stages  # noqa: E402
 
 # How long an example takes says something about the machine, not about the project.
 settings.register_profile("fluxvla", deadline=None)
@@ -79,11 +79,11 @@ def pytest_deselected(items: Sequence[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """The stages of a session are one run for people: what was skipped is told at its end."""
-    place = os.environ.get(skipped.FILE)
+    """Note the skipped tests: a session lists those of all its stages at its end."""
+    place = os.environ.get(stages.SKIPPED)
     if place and "PYTEST_XDIST_WORKER" not in os.environ:  # its controller counts what it skipped
         reports = terminalreporter.stats.get("skipped", [])
-        skipped.note(Path(place), [(r.nodeid, reason_of(r)) for r in reports])
+        stages.note_skipped(Path(place), [(r.nodeid, reason_of(r)) for r in reports])
 
 
 def reason_of(report: pytest.TestReport) -> str:
@@ -94,8 +94,8 @@ def reason_of(report: pytest.TestReport) -> str:
 
 @pytest.fixture(autouse=True)
 def _forget_plugin_files() -> Iterator[None]:
-    """What a test loaded with ``--plugin FILE`` is not there for the next one."""
+    """Unload the plugin files of a test (``--plugin FILE``)."""
     yield
-    files = sys.modules.get("fluxvla_core.plugins.files")
+    files = sys.modules.get("fluxvla_core.plugins.registry")
     if files is not None:
         files.forget_plugin_files()

@@ -3,10 +3,11 @@
     nox -s demo [-- --smoke | --full] [--fresh]     from demonstrations to an evaluated policy
     nox -s tests [-- PYTEST ARGUMENTS]              everything that CI checks
     nox -s nightly [-- PYTEST ARGUMENTS]            the tests that take minutes each
-    nox -s oracles                                  other implementations, again
-    nox -s skew [-- COMMIT]                         the released core with plugins at head, ...
-    nox -s py313 [-- PYTEST ARGUMENTS]              what needs no torch, on Python 3.13
-    nox -s lint | types | layers | bench            one part of it
+    nox -s oracles                                  the references in golden files, computed again
+    nox -s skew [-- COMMIT]                         the released core with current plugins, and back
+    nox -s py313 [-- PYTEST ARGUMENTS]              the tests without torch, on Python 3.13
+    nox -s lint | types | layers                    one part of the tests
+    nox -s bench [-- NAME]                          the benchmarks
     nox -s docs [-- serve]                          the documentation as a site, in site/
 
 Everything a session needs is installed by the session, into .nox/ and dist/ of this checkout.
@@ -28,7 +29,6 @@ sys.path.insert(0, str(ROOT))
 from tools import (  # noqa: E402
     envs,
     golden,
-    joined_env,
     lerobot_env,
     needs,
     oracle_env,
@@ -37,7 +37,6 @@ from tools import (  # noqa: E402
     rendering,
     shell,
     skew_check,
-    skipped,
     stages,
     torch_build,
     unseen,
@@ -106,9 +105,9 @@ def tests(session: nox.Session) -> None:
         for name in STAGES:
             step(name, lambda n=name: run_stage(dev, n))
         step("demo --smoke", lambda: run_demo(session, ["--smoke", "--fresh"]))
-        step("what the demo names", lambda: check_next_steps(session))
-        step("a stranger's plugin in the demo's environment", lambda: check_stranger(session))
-        step("what was skipped", lambda: print(*skipped.summary(SKIPPED), sep="\n"))
+        step("next steps named by the demo", lambda: check_next_steps(session))
+        step("a third party's plugin in the demo's environment", lambda: check_third_party(session))
+        step("skipped tests", lambda: print(*stages.summary(SKIPPED), sep="\n"))
 
 
 @nox.session
@@ -123,7 +122,7 @@ def nightly(session: nox.Session) -> None:
 
 @nox.session
 def environments(session: nox.Session) -> None:
-    """What the tests need besides .nox/dev: LeRobot to compare with, and the demo's environment."""
+    """Environments of the tests besides .nox/dev: LeRobot's, to compare with, and the demo's."""
     with Steps(session) as step:
         step("LeRobot", lambda: lerobot_env.prepare(session.log))
         step("LeRobot's policies", lambda: oracle_env.prepare_044(session.log))
@@ -132,9 +131,9 @@ def environments(session: nox.Session) -> None:
 
 @nox.session
 def oracles(session: nox.Session) -> None:
-    """What other implementations compute, computed again and compared with the golden files.
+    """Compute the golden files again with the reference implementations, and compare.
 
-    And the tests of fluxvla-lerobot that need LeRobot, with the LeRobot that most are made with.
+    Also runs the tests of fluxvla-lerobot that need LeRobot.
     """
     with Steps(session) as step:
         made: dict[Path, Path] = {}
@@ -161,7 +160,7 @@ def oracles(session: nox.Session) -> None:
                 step(name, lambda e=env, w=words: e.run("python", *w, cwd=ROOT))
         dev = dev_env(session)
         make_renderable(session, dev)
-        both = joined_env.join(env, dev)
+        both = envs.join(env, dev)
         words = ["-m", "pytest", ROOT / "plugins" / "fluxvla-lerobot" / "tests" / "with_lerobot"]
         variables = {**rendering.VARIABLES, **alone}
         step("fluxvla-lerobot", lambda: both.run("python", *words, cwd=ROOT, env=variables))
@@ -169,7 +168,7 @@ def oracles(session: nox.Session) -> None:
 
 @nox.session
 def skew(session: nox.Session) -> None:
-    """The released core with plugins at head, and released plugins with the core at head."""
+    """The released core with current plugins, and released plugins with the current core."""
     place = ROOT / ".nox" / "skew"
     with Steps(session) as step:
         builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
@@ -188,7 +187,7 @@ def skew(session: nox.Session) -> None:
 
 @nox.session
 def py313(session: nox.Session) -> None:
-    """What needs no torch, on Python 3.13: commands, configs, data, robots, evaluation, kits."""
+    """The tests without torch, on Python 3.13: commands, configs, robots, evaluation, kits."""
     with Steps(session) as step:
         pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
         env = pythons.filled(ROOT, nox.project.dependency_groups(pyproject, "dev"), session.log)
@@ -221,7 +220,7 @@ def types(session: nox.Session) -> None:
 
 @nox.session
 def layers(session: nox.Session) -> None:
-    """import-linter: which room of the core may import which."""
+    """import-linter: which package of the core may import which."""
     with Steps(session) as step:
         dev = dev_env(session)
         step("layers", lambda: dev.run("lint-imports", *session.posargs, cwd=ROOT))
@@ -249,8 +248,8 @@ def bench(session: nox.Session) -> None:
 
 
 def run_stage(dev: envs.Env, name: str) -> None:
-    """One call of pytest; the first stage notes which files the others have to look through."""
-    variables = {**rendering.VARIABLES, skipped.FILE: str(SKIPPED)}
+    """One call of pytest; the first stage lists the files with tests of the other stages."""
+    variables = {**rendering.VARIABLES, stages.SKIPPED: str(SKIPPED)}
     files: list[str] = []
     if name in MARKS:
         files = stages.files(LATER, MARKS[name])
@@ -298,7 +297,7 @@ def dev_env(session: nox.Session) -> envs.Env:
 
 
 def docs_env(session: nox.Session) -> envs.Env:
-    """.nox/docs: what builds the site, and what the core cannot be imported without."""
+    """.nox/docs: mkdocs and its plugins, and the core's dependencies."""
     env = envs.Env(ROOT / ".nox" / "docs")
     pyproject = nox.project.load_toml(ROOT / "pyproject.toml")
     needs = nox.project.dependency_groups(pyproject, "docs")
@@ -313,10 +312,7 @@ def docs_env(session: nox.Session) -> envs.Env:
 
 
 def demo_env(session: nox.Session) -> tuple[envs.Env, str]:
-    """.nox/demo: torch and the wheels of core and plugins, nothing else; and what they are made of.
-
-    The second value changes whenever the code of any wheel does.
-    """
+    """.nox/demo: torch and the wheels of core and plugins; and a digest of their code."""
     env = envs.Env(ROOT / ".nox" / "demo")
     dists = project.distributions(ROOT)
     built: dict[str, Path] = {}
@@ -406,7 +402,7 @@ def make_renderable(session: nox.Session, env: envs.Env) -> None:
 
 
 def run_demo(session: nox.Session, arguments: list[str]) -> None:
-    demo_program.parser().parse_args(arguments)  # a slip is told before anything is installed
+    demo_program.parser().parse_args(arguments)  # refuse bad arguments before installing anything
     began = time.monotonic()
     env, build = demo_env(session)
     words = ["--build", build, "--installed-in", f"{time.monotonic() - began:.1f}", *arguments]
@@ -418,7 +414,7 @@ def check_next_steps(session: nox.Session) -> None:
     next_steps.check(env, ROOT, Path("demo_out"))
 
 
-def check_stranger(session: nox.Session) -> None:
+def check_third_party(session: nox.Session) -> None:
     env, _ = demo_env(session)
     builder = wheels.builder_env(ROOT / ".nox" / "build", project.CONSTRAINTS)
     unseen.check(env, builder, ROOT / ".nox" / "stranger")

@@ -25,14 +25,14 @@ HEIGHT, WIDTH = 480, 640
 
 def engine(processes: int, steps: int, episodes: int, render: str) -> dict[str, Any]:
     """The evaluation engine: workers, evaluation log, records."""
-    from fluxvla_core.contracts.reporter import SilentReporter
+    from fluxvla_core.contracts.runner import SilentReporter
     from fluxvla_core.evaluation.episodes import EpisodeKey
     from fluxvla_core.evaluation.eval_log import open_eval_log
     from fluxvla_core.evaluation.policies import PolicySource
     from fluxvla_core.evaluation.pool import WorkerPool
     from fluxvla_core.evaluation.rollout import RolloutSettings, Settings
     from fluxvla_core.evaluation.runner import run_in_pool
-    from fluxvla_core.plugins.files import load_plugin_files
+    from fluxvla_core.plugins.registry import load_plugin_files
 
     load_plugin_files([__file__])
     settings = Settings(
@@ -105,7 +105,7 @@ def _loop(
 ) -> None:
     from fluxvla_sim.environment import AlohaSimEnvironment
 
-    from fluxvla_core.spec.embodiment import Camera
+    from fluxvla_core.spec import Camera
 
     environment = AlohaSimEnvironment(render=render)
     cameras = [Camera("top", HEIGHT, WIDTH)]
@@ -137,7 +137,7 @@ class _Single:
         import numpy as np
         from fluxvla_sim.environment import AlohaSimEnvironment
 
-        from fluxvla_core.spec.embodiment import Camera
+        from fluxvla_core.spec import Camera
 
         camera, limit = Camera("top", HEIGHT, WIDTH), self.steps
         environment = AlohaSimEnvironment(render=self.render)

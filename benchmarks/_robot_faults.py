@@ -35,9 +35,9 @@ from fluxvla_core.ros2 import (
     joints,
     message_class,
 )
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
+from fluxvla_core.testing.ros2 import claimed_domain
 from fluxvla_core.testing.ros2_driver import Driver
-from fluxvla_core.testing.ros_domains import claimed_domain
 
 Array = npt.NDArray[np.float64]
 NAMES = ("elbow", "wrist", "grip")

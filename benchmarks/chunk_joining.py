@@ -33,7 +33,7 @@ from fluxvla_core.contracts.policy import Continuation
 from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.policies.loading import find_checkpoint, load_policy
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]
 TASKS = {

@@ -37,7 +37,7 @@ from fluxvla_sim.environment import AlohaSimEnvironment
 from fluxvla_sim.expert import SimExpert
 
 from benchmarks import _results
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.evaluation.collect import demonstrate
 from fluxvla_core.evaluation.episodes import EpisodeKey
 from fluxvla_core.evaluation.eval_log import open_eval_log
@@ -45,7 +45,7 @@ from fluxvla_core.evaluation.policies import PolicySource
 from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.rollout import EpisodeWorker, RolloutSettings, Settings, run_episode
 from fluxvla_core.evaluation.runner import run_in_pool
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 CAMERA = Camera("top", 144, 192)
 PICTURES = 10

@@ -38,7 +38,7 @@ HEIGHT, WIDTH = 480, 640
 def make_datasets(folder: Path, episodes: int, frames: int) -> None:
     """``mp4`` and ``parquet`` below ``folder``: textured images that move, smooth joints."""
     from fluxvla_core.data.writer import LeRobotWriter
-    from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+    from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
     joints = tuple(Joint(f"joint_{i}", "rad", -3.0, 3.0, 2.0, 4.0) for i in range(JOINTS))
     scene = make_scene()

@@ -19,7 +19,7 @@ from fluxvla_aloha.embodiment import aloha_spec
 
 from benchmarks import _results
 from fluxvla_core.control.limits import CommandLimiter
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 HZ = 50.0
 LIMITS = {"velocity": 3.14, "acceleration": 20.0}

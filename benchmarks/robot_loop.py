@@ -64,8 +64,8 @@ from fluxvla_core.control import realtime
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.ros2 import IMAGE, JOINT_STATE
 from fluxvla_core.ros2.startup import large_frames_profile
+from fluxvla_core.testing.ros2 import claimed_domain
 from fluxvla_core.testing.ros2_driver import Driver
-from fluxvla_core.testing.ros_domains import claimed_domain
 
 RATE_HZ, HORIZON, EXECUTED = 50.0, 200, 25
 START_POSE = start_pose("viperx300")

@@ -32,8 +32,8 @@ from fluxvla_aloha.presets import COBOT_MAGIC
 from benchmarks import _results
 from fluxvla_core.ros2 import IMAGE, JOINT_STATE
 from fluxvla_core.ros2.startup import large_frames_profile
+from fluxvla_core.testing.ros2 import claimed_domain
 from fluxvla_core.testing.ros2_driver import Driver
-from fluxvla_core.testing.ros_domains import claimed_domain
 
 GOAL = 1.15
 ASKED_HZ = 10.0

@@ -40,8 +40,8 @@ from benchmarks.robot_loop import LATE_S
 from fluxvla_core import BaseInferenceRunner, RunContext
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.ros2 import FLOAT64, IMAGE, JOINT_STATE
+from fluxvla_core.testing.ros2 import claimed_domain
 from fluxvla_core.testing.ros2_driver import Driver
-from fluxvla_core.testing.ros_domains import claimed_domain
 
 RATE_HZ = 125.0
 POSE = (0.1, -1.5, 1.4, -1.3, -1.2, 0.2)

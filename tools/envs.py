@@ -35,7 +35,7 @@ class Env:
         return self.bin / "python"
 
     def variables(self) -> dict[str, str]:
-        """What an activated environment sets, for programs that look for it."""
+        """The variables of an activated environment."""
         path = os.pathsep.join([str(self.bin), os.environ.get("PATH", os.defpath)])
         return {"VIRTUAL_ENV": str(self.root), "PATH": path}
 
@@ -117,3 +117,47 @@ class Env:
 
     def _write_stamp(self, record: Mapping[str, str]) -> None:
         (self.root / STAMP).write_text(json.dumps(dict(record), indent=1), encoding="utf-8")
+
+
+class JoinedEnv(Env):
+    """The environment at ``root``, with the variables of the first of two environments."""
+
+    def __init__(self, root: Path, first: Env) -> None:
+        super().__init__(root)
+        object.__setattr__(self, "_given", first.variables())
+
+    def variables(self) -> dict[str, str]:
+        given: Mapping[str, str] = vars(self)["_given"]
+        return {**given, **super().variables()}
+
+
+def join(first: Env, second: Env, name: str = "joined") -> Env:
+    """A Python that imports from ``first``, and packages that are missing there from ``second``.
+
+    For LeRobot and this project, which pip would not install together: LeRobot needs an older torch
+    and PyAV than ``constraints.txt`` has. Nothing is installed or copied. The environment is a
+    folder of ``first``, and is created again on each call.
+
+    Args:
+        first, second: environments of the Python version that runs this.
+
+    Raises:
+        StepFailed: it cannot be made.
+        ValueError: one of them is of another Python version.
+    """
+    root = first.root / name
+    shutil.rmtree(root, ignore_errors=True)
+    shell.run([sys.executable, "-m", "venv", "--without-pip", root], quiet=True, echo=False)
+    own = _packages(root)
+    places = [_packages(env.root) for env in (first, second)]
+    if {place.parent.name for place in places} != {own.parent.name}:
+        raise ValueError(f"of several Python versions: {', '.join(map(str, (own, *places)))}")
+    # Not as lines of their own: then their .pth files, editable installations, would not be read.
+    lines = [f"import site; site.addsitedir({str(place)!r})" for place in places]
+    (own / "joined.pth").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    return JoinedEnv(root, first)
+
+
+def _packages(root: Path) -> Path:
+    (found,) = root.glob("lib/python*/site-packages")
+    return found

@@ -83,8 +83,8 @@ def compared(made: Mapping[str, Any], committed: Mapping[str, Any]) -> list[str]
     for name in sorted(set(made) & set(committed)):
         ours, theirs = made[name], committed[name]
         if ours.shape != theirs.shape or ours.dtype != theirs.dtype:
-            told = f"{ours.dtype} {ours.shape}, committed {theirs.dtype} {theirs.shape}"
-            lines.append(f"{name}: {told}")
+            both = f"{ours.dtype} {ours.shape}, committed {theirs.dtype} {theirs.shape}"
+            lines.append(f"{name}: {both}")
             continue
         apart = float(abs(ours.astype("float64") - theirs.astype("float64")).max(initial=0.0))
         largest = float(abs(theirs.astype("float64")).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""System packages that the tests need, without which some of them would be skipped in silence."""
+"""System packages without which some tests would be skipped silently."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def ensure(log: Callable[[str], None], needs: tuple[Need, ...] = NEEDS) -> None:
 
 
 def advice(lacking: list[Need]) -> str:
-    """What to tell a developer whose machine lacks something."""
+    """Instructions for a developer whose machine lacks something."""
     lines = [f"  {need.name}: {need.why} without it (Debian: {need.package})" for need in lacking]
     packages = " ".join(need.package for need in lacking)
     names = ",".join(need.name for need in lacking)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 CONSTRAINTS = ROOT / "constraints.txt"
-# What ends up in a wheel; tests, caches and notes do not, so editing them rebuilds nothing.
+# The files of a wheel. Tests, caches and notes are not among them: editing them rebuilds nothing.
 WHEEL_INPUTS = ("pyproject.toml", "README.md", "LICENSE", "src")
 
 

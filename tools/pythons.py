@@ -1,4 +1,4 @@
-"""An environment with Python 3.13, and what of FluxVLA needs no torch."""
+"""An environment with Python 3.13, for the parts of FluxVLA that need no torch."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NEED_MORE = (
     "tests/data/transforms/test_pipeline.py",
     "tests/data/test_tokenizer.py",  # tokenizers, and a package with one
 )
-"""What of the tests below needs what is not installed."""
+"""Tests among those below that need packages that are not installed."""
 TESTED = (
     "-m",
     "not network and not realtime and not slow",
@@ -47,7 +47,7 @@ TESTED = (
     "tests/evaluation",
     "tests/plugins",
     "tests/robot",
-    "tests/spec",
+    "tests/test_spec.py",
     "tests/test_hooks.py",
     "tests/test_registries.py",
     "tests/testing/test_action_filter_kit.py",
@@ -101,8 +101,8 @@ def filled(root: Path, needs: Sequence[str], log: Callable[[str], None]) -> Env:
     """
     python = find()
     if python is None:
-        told = f"there is no python{VERSION} on this machine: install it (apt, pyenv, uv)"
-        raise shell.StepFailed([f"python{VERSION}"], 127, told)
+        missing = f"there is no python{VERSION} on this machine: install it (apt, pyenv, uv)"
+        raise shell.StepFailed([f"python{VERSION}"], 127, missing)
     env = OtherPython(root / ".nox" / "py313", python)
     dists = [d for d in project.distributions(root) if d.path == root or d.name in PLUGINS]
     parts = {d.name: project.digest([d.path / "pyproject.toml"], relative_to=d.path) for d in dists}

@@ -1,4 +1,4 @@
-"""See to it that MuJoCo can render without a display, through Debian's Mesa where it may."""
+"""Make MuJoCo render without a display, by installing Debian's Mesa if necessary."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def apt_commands(rights: Sequence[str]) -> list[list[str]]:
 
 
 def advice(reason: str, *, have_apt: bool) -> str:
-    """What to tell a user whose machine cannot render and who must fix it by hand."""
+    """Instructions for a user whose machine cannot render."""
     head = f"MuJoCo cannot render without a display: {reason}\n"
     if have_apt:
         line = " && ".join(" ".join(command) for command in apt_commands(["sudo"]))

@@ -1,4 +1,4 @@
-"""Run a command in sight of the user and stop in a way that lets it finish what it must."""
+"""Run commands with their output shown; an interrupt leaves them time to save."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ INTERRUPT_SECONDS = 60.0
 class StepFailed(Exception):
     """A command ended with an exit status other than 0.
 
-    ``command`` is what was run, ``status`` its exit status, ``output`` what it printed when that
-    was kept back (``quiet=True``), else the empty string.
+    ``status`` is the exit status of ``command``; ``output`` its output if it was captured
+    (``quiet=True``), else the empty string.
     """
 
     def __init__(self, command: Sequence[str], status: int, output: str = "") -> None:
         self.command = tuple(command)
         self.status = status
         self.output = output
-        told = f"\n{output.rstrip()}" if output else ""
-        super().__init__(f"exit status {status} from: {shlex.join(self.command)}{told}")
+        shown = f"\n{output.rstrip()}" if output else ""
+        super().__init__(f"exit status {status} from: {shlex.join(self.command)}{shown}")
 
 
 def child_environment(extra: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -87,8 +87,7 @@ def run(
 def alongside(command: Sequence[str | os.PathLike[str]], *, cwd: Path) -> Iterator[None]:
     """Run a command while the body does something else, and wait for it after that.
 
-    Its output is kept back, and shown if it fails; that is all: whoever needs what it was to do
-    finds it undone. A body that fails ends it.
+    Its output is captured, and shown if it fails, which raises nothing. A body that fails ends it.
     """
     words = [os.fspath(word) for word in command]
     print(f"$ {shlex.join(words)} &", flush=True)

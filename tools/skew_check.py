@@ -28,9 +28,9 @@ KITS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fluxvla-latency": (("LatencyLog",),),
     "fluxvla-sim": (("AlohaSimOperator", "--simulated"),),
 }
-"""Distribution -> what is checked of it: the words that follow ``fluxvla plugins check``."""
+"""Distribution -> the arguments of ``fluxvla plugins check`` for its classes."""
 PLUGINS = (*KITS, "fluxvla-aloha", "fluxvla-mujoco", "fluxvla-ur")
-"""What is installed: those and what they require of the same state."""
+"""The installed distributions: those and their requirements, of the same state."""
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "src", "plugins")
 OTHER_API = re.compile(r"is written for \w+ 9\.0, this core speaks \d+\.\d+")
 
@@ -38,8 +38,8 @@ OTHER_API = re.compile(r"is written for \w+ 9\.0, this core speaks \d+\.\d+")
 class Skewed(StepFailed):
     """A pair does not work together, and nobody says so in words."""
 
-    def __init__(self, told: str) -> None:
-        super().__init__(("nox", "-s", "skew"), 1, told)
+    def __init__(self, problem: str) -> None:
+        super().__init__(("nox", "-s", "skew"), 1, problem)
 
 
 @dataclass(frozen=True)

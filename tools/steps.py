@@ -1,4 +1,4 @@
-"""Run the parts of a session one after the other and name all that failed at the end."""
+"""Run the parts of a session one after the other, and list those that failed at the end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tools.shell import StepFailed
 
 
 class Steps:
-    """A failing part does not keep the next one from running: CI tells everything in one go.
+    """Runs the parts of a session; a failing part does not keep the next one from running.
 
         with Steps(session) as step:
             step("lint", check_lint)
@@ -29,7 +29,7 @@ class Steps:
         return self
 
     def __call__(self, name: str, action: Callable[[], object]) -> None:
-        """Run one part; its StepFailed is said and kept in mind."""
+        """Run one part; its StepFailed is printed, and fails the session at its end."""
         self._session.log(f"== {name}")
         began = time.monotonic()
         try:

@@ -1,6 +1,6 @@
-"""A plugin that the repository has never seen, and broken ones, made from text when asked for.
+"""A third party's plugin and broken ones, generated to test an installation.
 
-They stand for what a third party publishes: a wheel with entry points, installed next to the core.
+They are wheels with entry points, unknown to the repository, and installed next to the core.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ SYMPTOMS = (
     "not exist",
     "fluxvla-typo 4.2: 7 in fluxvla.runners is a int, not a class",
 )
-"""What the doctor has to say of the broken ones, all of them installed."""
+"""Messages of the doctor about the broken ones, all of them installed."""
 
 
 def write_project(folder: Path, name: str, operator: str, runner: str, module: str) -> Path:
@@ -187,7 +187,7 @@ def wheel(project: Path, folder: Path, builder: Env | None = None) -> Path:
 
 
 def install(env: Env, *wheels: Path) -> None:
-    """Install wheels into ``env`` without looking anywhere for what they depend on."""
+    """Install wheels into ``env`` without their dependencies."""
     words = ["-q", "--no-deps", "--no-index", "--disable-pip-version-check", *map(str, wheels)]
     env.run("python", "-m", "pip", "install", *words, quiet=True, echo=False)
 
@@ -198,12 +198,12 @@ def remove(env: Env, *names: str) -> None:
 
 
 def check(env: Env, builder: Env, folder: Path) -> None:
-    """Install a stranger's plugin into ``env``, run it by config alone; also with broken ones.
+    """Install a third party's plugin into ``env`` and run it by a config, also next to broken ones.
 
     ``env`` is as before when this returns or raises.
 
     Raises:
-        StepFailed: a command failed, or did not say what it must.
+        StepFailed: a command failed, or its output lacks something.
     """
     shutil.rmtree(folder, ignore_errors=True)
     config = folder / "acme.toml"
@@ -221,11 +221,11 @@ def check(env: Env, builder: Env, folder: Path) -> None:
         info = corrupt(env)
         _expect(env, "AcmeEvalRunner", "plugins", "list")
         _expect(env, "reached: True", *run)
-        told = diagnosis(env)
-        if lacking := [words for words in SYMPTOMS if words not in told]:
-            raise StepFailed(["fluxvla", *DOCTOR], 1, f"did not say {lacking}:\n{told}")
-        if "fluxvla-acme" in told:
-            raise StepFailed(["fluxvla", *DOCTOR], 1, f"blamed what is sound:\n{told}")
+        found = diagnosis(env)
+        if lacking := [words for words in SYMPTOMS if words not in found]:
+            raise StepFailed(["fluxvla", *DOCTOR], 1, f"did not say {lacking}:\n{found}")
+        if "fluxvla-acme" in found:
+            raise StepFailed(["fluxvla", *DOCTOR], 1, f"blamed what is sound:\n{found}")
     finally:
         remove(env, "fluxvla-acme", "fluxvla-broken", "fluxvla-typo", "fluxvla-garbled")
         if info is not None:
@@ -233,7 +233,7 @@ def check(env: Env, builder: Env, folder: Path) -> None:
 
 
 def diagnosis(env: Env) -> str:
-    """What ``fluxvla plugins doctor`` says of an installation with something broken in it.
+    """The output of ``fluxvla plugins doctor`` for an installation with broken plugins.
 
     Raises:
         StepFailed: it finds nothing, or does not end as a command that found something.

@@ -3,47 +3,51 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
+
+_IMPORT = re.compile(r"^    from ([\w.]+) import \(?\s*(\w+) as \2\b", re.MULTILINE)
 
 
 def attach(
-    module: str,
-    exports: Mapping[str, Sequence[str]],
-    deprecated: Mapping[str, str] | None = None,
+    module: str, deprecated: Mapping[str, str] | None = None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a public module.
 
-    A module is exported by its own name alone: ``{"fluxvla_core.ros2.joints": ["joints"]}``.
-    ``if TYPE_CHECKING`` imports next to it let type checkers and editors know the names;
-    ``tests/test_surface.py`` compares the two.
+    Its names are those that it imports under ``if TYPE_CHECKING``, each as
+    ``from package.module import Name as Name``. Type checkers and editors follow these imports;
+    here they are read from the source.
 
     Args:
         module: ``__name__`` of the public module.
-        exports: inner module -> names that it provides.
         deprecated: old name -> the new one. An old name still works, with a DeprecationWarning; it
             is not in ``__all__``.
     """
-    sources = {name: source for source, names in exports.items() for name in names}
+    public: Any = sys.modules[module]
+    with open(public.__file__, encoding="utf-8") as file:
+        sources = {name: source for source, name in _IMPORT.findall(file.read())}
     renamed = dict(deprecated or {})
-    modules = {s for s, names in exports.items() if list(names) == [s.rpartition(".")[2]]}
 
     def __getattr__(name: str) -> Any:
         if name in renamed:
             message = f"{module}.{name} is deprecated, use {module}.{renamed[name]}"
             warnings.warn(message, DeprecationWarning, stacklevel=2)
-            return getattr(sys.modules[module], renamed[name])
+            return getattr(public, renamed[name])
         source = sources.get(name)
         if source is None:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
-        found = importlib.import_module(source)
-        value = found if source in modules else getattr(found, name)
-        setattr(sys.modules[module], name, value)
+        package = public if source == module else importlib.import_module(source)
+        if package is not public and hasattr(package, name):
+            value = getattr(package, name)
+        else:  # a module of the package
+            value = importlib.import_module(f"{source}.{name}")
+        setattr(public, name, value)
         return value
 
     def __dir__() -> list[str]:
-        return sorted({*vars(sys.modules[module]), *sources})
+        return sorted({*vars(public), *sources})
 
     return __getattr__, __dir__, sorted(sources)

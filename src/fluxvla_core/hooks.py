@@ -1,10 +1,10 @@
-"""Hooks: calls the observers that a config names, and keeps a run safe from them.
+"""Hooks: calls the observers of a run that its config names, without letting them disturb it.
 
-What they may observe is :class:`fluxvla_core.contracts.Hook`. pluggy checks each hook's name and
-arguments against it and does the calling, for each in a thread of its own: the run hands over what
-happened and goes on. One that raises, ends its thread or falls behind is reported once, with its
-origin, and left out for the rest of the run: an observer must never end, or delay, the training or
-the motion that it watches. What it can still do is keep the interpreter's lock or end the process.
+They have methods of :class:`fluxvla_core.contracts.runner.Hook`. pluggy checks names and arguments
+and calls them, each hook in a thread of its own: the run queues a call and continues. A hook that
+raises, ends its thread or falls behind is reported once and left out for the rest of the run: an
+observer must never end, or delay, a training or a motion. It can still keep the interpreter's lock
+or end the process.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ for _function in public_methods(Hook).values():
 
 
 MOST_WAITING = 10_000
-"""Calls that may wait for a hook, whatever its ``budget_s``: what they hold takes memory."""
+"""Calls that may wait for a hook, whatever its ``budget_s``: their arguments take memory."""
 _LATE_TWICE_S = 0.2
 
 
@@ -47,13 +47,13 @@ class HookCaller:
         self._lock = threading.Lock()
 
     def call(self, hook: str, **arguments: Any) -> None:
-        """Tell each hook; returns at once, but for ``run_finished``, which waits for them.
+        """Call each hook; returns at once, except for ``run_finished``, which waits for them.
 
-        What went wrong with one since the last call is reported, and it is left out from then on.
+        A hook that failed since the last call is reported, and left out from then on.
         """
         observers = list(self._observers)
         for observer in observers:
-            observer.tell(hook, {"context": self._context, **arguments})
+            observer.enqueue(hook, {"context": self._context, **arguments})
         if hook == "run_finished":
             for observer in observers:
                 observer.finish()
@@ -68,7 +68,7 @@ class HookCaller:
                 observer.end()
 
     def _remove(self, observer: _Observer) -> bool:
-        """Whether it was there: a robot's events come from several threads."""
+        """Whether this call removed it: a robot's events come from several threads."""
         with self._lock:
             if observer not in self._observers:
                 return False
@@ -76,7 +76,7 @@ class HookCaller:
             return True
 
     def settle(self) -> None:
-        """Wait until the hooks have been called with all that happened; for tests."""
+        """Wait until all queued calls are done; for tests."""
         for observer in self._observers:
             observer.finish()
 
@@ -108,8 +108,8 @@ class _Observer:
         self._ended = False
         self._thread: threading.Thread | None = None
 
-    def tell(self, hook: str, arguments: dict[str, Any]) -> None:
-        """Have it called, soon and in another thread, if it has such a method."""
+    def enqueue(self, hook: str, arguments: dict[str, Any]) -> None:
+        """Have the method called in the hook's thread, if the hook has it."""
         if hook not in self._hooks:
             return
         with self._changed:
@@ -127,9 +127,9 @@ class _Observer:
             self._changed.notify_all()
 
     def trouble(self) -> str:
-        """What is wrong with it: ``after_step raised ...``; empty if nothing is.
+        """The problem of this hook: ``after_step raised ...``; empty if there is none.
 
-        Late is who is seen late twice, a moment apart: after a pause of the whole process all are.
+        A hook is late if it is late twice, a moment apart: after a pause of the process all are.
         """
         with self._changed:
             if self._problem or not self._waiting:
@@ -148,7 +148,7 @@ class _Observer:
             return self._problem
 
     def finish(self) -> None:
-        """Wait until it has been called with all that it was told, for its budget at most."""
+        """Wait until all queued calls are done, at most for its budget."""
         with self._changed:
             done = lambda: not self._waiting or bool(self._problem)  # noqa: E731
             if not self._changed.wait_for(done, min(self._budget_s, threading.TIMEOUT_MAX)):
@@ -156,7 +156,7 @@ class _Observer:
                 self._problem = self._slow(hook, time.monotonic() - since)
 
     def end(self) -> None:
-        """Call it no more; a call that is under way is left to itself."""
+        """Stop calling it; a call under way is not waited for."""
         with self._changed:
             self._ended = True
             self._waiting.clear()
@@ -166,7 +166,6 @@ class _Observer:
         return f"{hook} is {seconds:.1f} s behind the run, and may be {self._budget_s:g} s"
 
     def _call(self) -> None:
-        """The thread's life."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._ended)
@@ -208,7 +207,7 @@ def build_hooks(context: RunContext) -> HookCaller:
 
 
 def _manager(name: str, plugin: object) -> tuple[pluggy.PluginManager, frozenset[str]]:
-    """What calls a hook's methods, and their names."""
+    """pluggy's manager of one hook, and the names of its methods."""
     # One manager for each plugin: within one, pluggy stops at the first exception.
     manager = pluggy.PluginManager("fluxvla")
     manager.add_hookspecs(Hook)
@@ -226,7 +225,7 @@ def _manager(name: str, plugin: object) -> tuple[pluggy.PluginManager, frozenset
 
 
 class _Marked:
-    """Presents the hook-named methods that an object brings to pluggy as implementations."""
+    """The hook methods of an object, marked as implementations for pluggy."""
 
     def __init__(self, plugin: object) -> None:
         brought = [name for name in NAMES if implements(plugin, Hook, name)]

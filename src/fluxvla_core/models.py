@@ -1,5 +1,5 @@
-"""Models and policies: what a model family is written with, how a trained policy is loaded, and how
-checkpoints of other projects are read."""
+"""Public API for models and policies: building a model family, loading a trained policy, reading
+checkpoints of other projects."""
 
 from __future__ import annotations
 
@@ -34,33 +34,4 @@ if TYPE_CHECKING:
     from fluxvla_core.training.model import built_without_memory as built_without_memory
     from fluxvla_core.training.model import has_values as has_values
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.build": [
-            "build_head_from_cfg",
-            "build_llm_backbone_from_cfg",
-            "build_projector_from_cfg",
-            "build_vision_backbone_from_cfg",
-            "build_vlm_backbone_from_cfg",
-        ],
-        "fluxvla_core.checkpoints.foreign": [
-            "check_settings",
-            "chosen_robot",
-            "foreign_folder",
-            "renamed",
-            "safetensors_in",
-            "torch_table",
-            "without_cameras",
-        ],
-        "fluxvla_core.checkpoints.shards": ["Stored"],
-        "fluxvla_core.contracts.checkpoint_format": ["CheckpointFormat", "ForeignCheckpoint"],
-        "fluxvla_core.contracts.frame": ["Observation"],
-        "fluxvla_core.contracts.policy": ["Policy"],
-        "fluxvla_core.contracts.training": ["PartWeights", "VLA"],
-        "fluxvla_core.data.pretrained": ["model_folder", "resolve_model_path"],
-        "fluxvla_core.policies.loading": ["load_policy"],
-        "fluxvla_core.training.model": ["built_without_memory", "has_values"],
-        "fluxvla_core.training.export": ["embodiment_in"],
-    },
-)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__)

@@ -1,8 +1,8 @@
-"""Robots: what an operator, an inference runner or an action filter is written with.
+"""Public API for operators, inference runners and action filters.
 
 An operator connects one kind of robot, which an :class:`EmbodimentSpec` describes; a runner drives
 it by a policy. Units are SI; times are seconds on the operator's clock. ``fluxvla_core.ros2`` has
-what operators of ROS 2 robots share.
+the common parts of ROS 2 operators.
 """
 
 from __future__ import annotations
@@ -35,23 +35,8 @@ if TYPE_CHECKING:
     from fluxvla_core.robot.tasks import check_descriptions as check_descriptions
     from fluxvla_core.robot.tasks import task_source as task_source
     from fluxvla_core.robot.tasks import tasks as tasks
-    from fluxvla_core.spec.embodiment import Camera as Camera
-    from fluxvla_core.spec.embodiment import EmbodimentSpec as EmbodimentSpec
-    from fluxvla_core.spec.embodiment import Joint as Joint
+    from fluxvla_core.spec import Camera as Camera
+    from fluxvla_core.spec import EmbodimentSpec as EmbodimentSpec
+    from fluxvla_core.spec import Joint as Joint
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.build": ["RunContext"],
-        "fluxvla_core.contracts.frame": ["Frame", "Observation", "STATE"],
-        "fluxvla_core.contracts.policy": ["Continuation", "Policy"],
-        "fluxvla_core.contracts.robot": ["ActionFilter", "Clock", "Operator", "Part"],
-        "fluxvla_core.control.clock": ["MonotonicClock", "SimulatedClock"],
-        "fluxvla_core.control.filters": ["LowPass", "SnapGripper", "WorkspaceBox"],
-        "fluxvla_core.control.safety": ["SafetySettings"],
-        "fluxvla_core.robot.recording.trace": ["EpisodeTrace", "next_folder"],
-        "fluxvla_core.robot.runner": ["BaseInferenceRunner"],
-        "fluxvla_core.robot.tasks": ["Task", "check_descriptions", "task_source", "tasks"],
-        "fluxvla_core.spec.embodiment": ["Camera", "EmbodimentSpec", "Joint"],
-    },
-)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__)

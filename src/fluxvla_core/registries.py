@@ -28,10 +28,10 @@ class RegistryRow(NamedTuple):
 
     Args:
         name: in messages and code; the entry-point group is ``fluxvla.<name>``.
-        kind: one of its classes, in the name of its build function; None builds none.
-        contract: ``module:class`` of the base class whose methods are the contract; None for
-            classes that only the plugin that builds them calls.
-        about: what its classes are, for people.
+        kind: singular, for the name of its build function; None if it has none.
+        contract: ``module:class`` of the base class; None for classes that only their own plugin
+            calls.
+        about: description of its classes.
         api: version of the contract that this core speaks. A class declares ``api = "1.0"``: the
             same major and no newer minor is accepted.
     """

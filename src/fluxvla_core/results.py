@@ -13,7 +13,7 @@ from fluxvla_core import _lazy
 if TYPE_CHECKING:
     from fluxvla_core.atomic import prepare_folder as prepare_folder
     from fluxvla_core.atomic import write_text as write_text
-    from fluxvla_core.config.snapshot import work_dirs_below as work_dirs_below
+    from fluxvla_core.config.load import work_dirs_below as work_dirs_below
     from fluxvla_core.robot.recording import episode_log as episode_log
     from fluxvla_core.robot.recording.recorded import bag_of as bag_of
     from fluxvla_core.robot.recording.recorded import is_recording as is_recording
@@ -25,19 +25,4 @@ if TYPE_CHECKING:
     from fluxvla_core.untrusted import read_bytes as read_bytes
     from fluxvla_core.untrusted import read_json as read_json
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.atomic": ["prepare_folder", "write_text"],
-        "fluxvla_core.config.snapshot": ["work_dirs_below"],
-        "fluxvla_core.robot.recording.episode_log": ["episode_log"],
-        "fluxvla_core.robot.recording.recorded": [
-            "bag_of",
-            "is_recording",
-            "open_recording",
-            "read_bag",
-        ],
-        "fluxvla_core.robot.recording.trace": ["EVENTS_FILE", "SUMMARY_FILE"],
-        "fluxvla_core.untrusted": ["parse_json", "read_bytes", "read_json"],
-    },
-)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__)

@@ -1,4 +1,4 @@
-"""Answering signals: what a robot's loop, a training, its processes and the command line share."""
+"""Signal handling that robots, training, worker processes and the command line share."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ from types import FrameType
 Handler = Callable[[int, "FrameType | None"], None]
 
 
+def signal_name(number: int) -> str:
+    """The name of a signal, for example ``SIGKILL``; most real-time signals have only a number."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
 def requests_to_stop() -> list[int]:
     """The signals that ask a process to stop: SIGINT, SIGTERM, and SIGHUP unless it is ignored.
 
-    SIGHUP comes when the terminal goes away, with the network that a person is logged in through;
-    ``nohup`` starts a process that ignores it, and so it shall stay.
+    SIGHUP comes when the terminal, or the network connection to it, is closed; a process started
+    with ``nohup`` ignores it, and continues to.
     """
     numbers: list[int] = [signal.SIGINT, signal.SIGTERM]
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
@@ -25,11 +33,10 @@ def requests_to_stop() -> list[int]:
 
 
 def leave_stopping_to_the_parent() -> None:
-    """Let this worker process end when its parent ends it, or is gone, and of no request to stop.
+    """Ignore requests to stop in this worker process, and end it when its parent is gone.
 
-    A terminal, a scheduler and torch's agent send theirs to whole groups of processes: the parent
-    decides what it means, and may need the worker until it has. It ends one that does not end by
-    itself with SIGKILL.
+    Terminals, schedulers and torch's agent signal whole groups of processes. The parent decides
+    what follows, may need the worker until then, and ends it with SIGKILL if necessary.
     """
     from multiprocessing import parent_process
     from multiprocessing.connection import wait
@@ -51,17 +58,17 @@ def leave_stopping_to_the_parent() -> None:
 
 @contextmanager
 def held_back(start_method: str) -> Iterator[None]:
-    """Requests to stop wait while this is entered, in processes that are started in it as well.
+    """Block requests to stop inside, also in processes that are started inside.
 
-    Those let them in by :func:`leave_stopping_to_the_parent`.
+    Those unblock them in :func:`leave_stopping_to_the_parent`.
 
     Args:
-        start_method: multiprocessing's, of these processes.
+        start_method: of these processes (multiprocessing).
     """
     if start_method != "fork":
         from multiprocessing import resource_tracker
 
-        # It would be started with the first of them, and lets everything in again at that.
+        # It would start with the first process, and unblock the signals.
         resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, requests_to_stop())
     try:
@@ -72,10 +79,9 @@ def held_back(start_method: str) -> Iterator[None]:
 
 @contextmanager
 def handling(handler: Handler, *numbers: int) -> Iterator[None]:
-    """``handler`` answers these signals while this is entered; then the previous handlers do.
+    """Handle these signals with ``handler`` inside; the previous handlers are restored.
 
-    Only the main thread can arrange that: in another one nothing changes, and the main
-    thread's handlers stay.
+    Only the main thread can set handlers: in another one nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,8 +1,7 @@
-"""Read untrusted files: regular files of bounded size, and JSON checked against a type.
+"""Read untrusted files: regular files of bounded size, and JSON validated against a type.
 
-Every JSON file of a dataset, a checkpoint, a recording or a plugin is read through here, so that
-a pipe, a device, gigabytes, deep nesting or a value of another type is one error that names the
-file and the field.
+Every JSON file of a dataset, a checkpoint, a recording or a plugin is read here, so that a pipe, a
+device, gigabytes, deep nesting or a value of another type is an error that names file and field.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest, new
 from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, read_manifest
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec("arm", (Joint("j", "rad", -1.0, 1.0, 1.0, 1.0),), (), 10.0)
 

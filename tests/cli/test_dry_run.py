@@ -14,7 +14,7 @@ import pytest
 from fluxvla_core.cli.main import main
 from fluxvla_core.data import LeRobotWriter
 from fluxvla_core.plugins.registry import VLAS
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
 

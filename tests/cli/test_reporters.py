@@ -193,7 +193,7 @@ def test_count_bar_and_time_left_stay_where_the_terminal_is_narrow(columns: int)
     """In a terminal of its own: the program that draws runs behind a real pty."""
     code = (
         "import sys, time\n"
-        "from fluxvla_core.cli.choose_reporter import make_reporter\n"
+        "from fluxvla_core.cli.reporters import make_reporter\n"
         "from fluxvla_core.cli.reporters import KeepAliveReporter\n"
         "reporter = KeepAliveReporter(make_reporter('text'), every=0.4)\n"
         "for step in range(340, 344):\n"

@@ -10,9 +10,8 @@ import pytest
 
 from fluxvla_core.cli.plan import default_work_dir
 from fluxvla_core.cli.reporters import KeepAliveReporter
-from fluxvla_core.config.load import load_config
+from fluxvla_core.config.load import load_config, write_resolved
 from fluxvla_core.config.overrides import apply_overrides
-from fluxvla_core.config.snapshot import write_resolved
 from tests.cli.messages import said
 from tests.conftest import Install
 

@@ -71,3 +71,18 @@ def test_an_ascii_terminal_is_enough(tmp_path: Path) -> None:
     assert code == 2
     assert b"Traceback" not in said
     assert rb"gr\xf6\xdfe.toml" in said
+
+
+def test_a_closed_stream_is_the_null_device(tmp_path: Path) -> None:
+    """Or the next file would get its number, and be the stdin of a process that is started."""
+    found = tmp_path / "found"
+    program = (
+        "import os, sys; from fluxvla_core.cli.terminal import prepare; prepare();"
+        "number = os.open('/dev/zero', os.O_RDONLY); print('nobody', file=sys.stdout);"
+        "said = sys.stdin.read(), sys.stdout.isatty(), sys.stderr.isatty(), number > 2;"
+        f"open({str(found)!r}, 'w').write(repr(said))"
+    )
+    line = ["sh", "-c", '"$@" <&- >&- 2>&-', "sh", sys.executable, "-c", program]
+
+    assert subprocess.run(line, timeout=60).returncode == 0
+    assert found.read_text() == repr(("", False, False, True))

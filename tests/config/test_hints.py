@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.config.hints import complete, whole_options
+from fluxvla_core.config.overrides import complete, whole_options
 from fluxvla_core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.config.load import load_config
-from fluxvla_core.config.snapshot import write_resolved
+from fluxvla_core.config.load import load_config, write_resolved
 from fluxvla_core.errors import ConfigError
 
 from .conftest import Write

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core import atomic
-from fluxvla_core.config.snapshot import environment, write_resolved
+from fluxvla_core.config.load import environment, write_resolved
 from fluxvla_core.config.tree import Config
 from tests.conftest import Install
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.data.writer import LeRobotWriter
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 HOLD, HAND = "hold the cube", "hand the cube over"
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.sampler import EpochSampler, Position, sample_rng
 from fluxvla_core.errors import ConfigError, DataError

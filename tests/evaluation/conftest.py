@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.commands import SilentReporter
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 WALKING = Path(__file__).with_name("walking.py")
 

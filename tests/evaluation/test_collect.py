@@ -16,7 +16,7 @@ import pytest
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.cli.reporters import KeepAliveReporter
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.data.writer import EpisodeBuffer, staging_of
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
 from fluxvla_core.evaluation.collect import (
@@ -30,7 +30,7 @@ from fluxvla_core.evaluation.collect import (
     task_of,
 )
 from fluxvla_core.evaluation.provenance import unseen_seeds
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from tests.evaluation.conftest import WALKING
 
 pyarrow = pytest.importorskip("pyarrow.parquet")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.errors import RunFailed, UsageError
 from fluxvla_core.evaluation.episodes import EpisodeKey
 from fluxvla_core.evaluation.eval_log import EvalLog, open_eval_log

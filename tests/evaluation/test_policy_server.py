@@ -10,7 +10,7 @@ import pytest
 from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluation.policy_server import PolicyServer, ServedPolicy, check_rows
 from fluxvla_core.policies.local import Question
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 pytest.importorskip("torch")
 

@@ -9,7 +9,7 @@ import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 from tests.evaluation import workers
 
 

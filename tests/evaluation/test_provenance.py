@@ -10,7 +10,7 @@ import pytest
 from fluxvla_core.evaluation import provenance
 from fluxvla_core.evaluation.eval_log import code_differences
 from fluxvla_core.evaluation.provenance import code_of, commit, rendering
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 
 def test_versions_are_of_what_a_config_names_and_of_what_that_computes_with():

@@ -8,7 +8,7 @@ import os
 
 import pytest
 
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.errors import CheckpointError, RunFailed
 from fluxvla_core.evaluation import results_file
 from fluxvla_core.evaluation.policies import chosen_checkpoint

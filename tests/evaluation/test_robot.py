@@ -15,7 +15,7 @@ from fluxvla_core.evaluation.robot import RobotEvalRunner
 from fluxvla_core.operators import EpisodeTrace
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
 from fluxvla_core.robot.runner import BaseInferenceRunner
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec("slider", (Joint("x", "m", -2.0, 2.0, 5.0, 200.0, "prismatic"),), (), 50.0)
 TASKS = {"1": "go to the right", "2": "go to the left"}

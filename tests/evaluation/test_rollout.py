@@ -14,7 +14,7 @@ from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluation.policies import RandomPolicy, match_policy, resolve_policy
 from fluxvla_core.evaluation.rollout import RolloutSettings, memory_mb, run_episode, swapped_task
 from fluxvla_core.evaluation.stepping import Diverged
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from fluxvla_core.errors import ConfigError, MissingPlugin, RunFailed, SpecMisma
 from fluxvla_core.evaluation.collect import Collection, collect
 from fluxvla_core.evaluation.compare import read
 from fluxvla_core.evaluation.runner import EvalRunner
-from fluxvla_core.plugins.files import forget_plugin_files, load_plugin_files
+from fluxvla_core.plugins.registry import forget_plugin_files, load_plugin_files
 from tests.evaluation.conftest import WALKING
 from tests.evaluation.runs import WALK, evaluate
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.evaluation.videos import (
     choose_episodes,

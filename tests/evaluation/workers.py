@@ -104,7 +104,7 @@ class Episodes:
 
 def evaluate_forever(folder: str) -> None:
     """What a killed or interrupted evaluation runs: slow episodes into a log."""
-    from fluxvla_core.contracts.reporter import SilentReporter
+    from fluxvla_core.contracts.runner import SilentReporter
     from fluxvla_core.evaluation.episodes import EpisodeKey
     from fluxvla_core.evaluation.eval_log import EvalLog
     from fluxvla_core.evaluation.pool import WorkerPool

@@ -8,7 +8,7 @@ import pytest
 
 from fluxvla_core import HOOKS
 from fluxvla_core.errors import LoadFailed, UsageError
-from fluxvla_core.plugins.files import forget_plugin_files, load_plugin_files, plugin_files
+from fluxvla_core.plugins.registry import forget_plugin_files, load_plugin_files, plugin_files
 
 GOOD = """
 from fluxvla_core import HOOKS

@@ -10,8 +10,8 @@ from packaging.utils import canonicalize_name
 
 from fluxvla_core import OPERATORS, RUNNERS, Registry
 from fluxvla_core.errors import AmbiguousPlugin, IncompatiblePlugin, LoadFailed, MissingPlugin
-from fluxvla_core.plugins import Plugin, first_party
-from fluxvla_core.plugins._metadata import version
+from fluxvla_core.plugins import first_party
+from fluxvla_core.plugins._metadata import Plugin, version
 from fluxvla_core.plugins.load import unmet
 
 ROOT = Path(__file__).parents[2]

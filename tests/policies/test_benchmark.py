@@ -12,7 +12,7 @@ import pytest
 from fluxvla_core.cli.bench_command import table
 from fluxvla_core.cli.main import main
 from fluxvla_core.plugins.registry import VLAS
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
 

@@ -10,7 +10,7 @@ import pytest
 
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
 
@@ -29,7 +29,7 @@ from fluxvla_core.policies.inference_weights import (  # noqa: E402
     store_in_bf16,
 )
 from fluxvla_core.policies.local import LocalPolicy  # noqa: E402
-from fluxvla_core.testing.capture import Refused, Tape, check_capturable  # noqa: E402
+from fluxvla_core.testing.execution import Refused, Tape, check_capturable  # noqa: E402
 
 ARM = EmbodimentSpec("arm", tuple(Joint(n, "rad", -1.0, 1.0, 1.0, 1.0) for n in "ab"), (), 50.0)
 

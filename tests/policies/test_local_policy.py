@@ -12,7 +12,7 @@ import pytest
 
 from fluxvla_core.errors import CheckpointError, ConfigError, DataError, SpecMismatch
 from fluxvla_core.plugins.registry import VLAS
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
 safetensors = pytest.importorskip("safetensors.torch")
@@ -240,7 +240,7 @@ def test_images_with_more_pixels_are_scaled_before_pixels_are_cut_by_number(tmp_
     with pytest.raises(DataError, match=r"gives uint8 of shape \(0, 128, 3\)"):
         policy.predict_action(large)
     large["images"]["front"] = np.zeros((96, 96, 3), np.uint8)
-    with pytest.raises(DataError, match="'front' gives 96 x 96 images; .* on 24 x 32: another vi"):
+    with pytest.raises(DataError, match=r"'front' gives 96 x 96 images; .* on 24 x 32: another vi"):
         policy.predict_action(large)
 
 

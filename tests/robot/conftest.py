@@ -16,7 +16,7 @@ from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.robot.runner import BaseInferenceRunner
 from fluxvla_core.ros2 import RobotFrame
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
     "testarm",

@@ -9,7 +9,7 @@ from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.errors import SafetyStop
 from fluxvla_core.robot.inference import FreshnessGate
 from fluxvla_core.robot.operator_values import check_frame
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
     "arm",

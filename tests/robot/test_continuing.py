@@ -10,7 +10,7 @@ from fluxvla_core.control.joiners import soft_mask
 from fluxvla_core.data.transforms.state_action import DenormalizePrivateAction
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.policies.local import scaling_of
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 torch = pytest.importorskip("torch")
 

@@ -19,7 +19,7 @@ def ends():
     memory = make_memory()
     main, control = Link(memory, control=False), Link(memory, control=True)
     os.close(memory)
-    return main, Inbox(control, SafetySettings())
+    return main, Inbox(control, SafetySettings(), os.getppid())
 
 
 def test_a_signal_right_after_the_order_to_run_ends_the_episode(ends):

@@ -7,7 +7,7 @@ import pytest
 
 from fluxvla_core.control.filters import LowPass, SnapGripper
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 
 def gripper(name, opened, closed):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fluxvla_core.control.limits import Clamp, CommandLimiter, braking_speed
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 JOINTS = (
     Joint("shoulder", "rad", -1.0, 1.5, 2.0, 10.0),

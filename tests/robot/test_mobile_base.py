@@ -15,7 +15,7 @@ from fluxvla_core.control.limits import Clamp, CommandLimiter
 from fluxvla_core.control.sender import check_pose, ramp
 from fluxvla_core.errors import ConfigError, SafetyStop
 from fluxvla_core.ros2.stop_motion import braking_commands, hold_target
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 from tests.robot.conftest import ARM, HOME, Arm
 
 FORWARD = Joint.base("base_forward", "m/s", 0.5, 1.0, backward=0.2)

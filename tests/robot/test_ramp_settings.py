@@ -9,7 +9,7 @@ from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.control.safety import SafetySettings
 from fluxvla_core.control.sender import ramp
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
     "arm", (Joint("a", "rad", -3, 3, 2, 10), Joint("b", "rad", -3, 3, 1, 20)), (), 50

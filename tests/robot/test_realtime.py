@@ -18,7 +18,7 @@ from fluxvla_core.control.clock import Rate
 from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.control.safety import SafetySettings
 from fluxvla_core.control.tracking import TrackingWatch
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 on_linux = pytest.mark.skipif(
     sys.platform != "linux" or os.sched_getscheduler(0) != os.SCHED_OTHER,

@@ -15,7 +15,7 @@ from fluxvla_core.data.metadata import read_metadata
 from fluxvla_core.errors import DataError, SpecMismatch
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.robot.recording.to_dataset import recordings_to_dataset, row_times
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.spec import Camera, EmbodimentSpec
 
 pytest.importorskip("rosbags")
 pytest.importorskip("av")

@@ -15,7 +15,7 @@ from fluxvla_core.robot.inference import FreshnessGate
 from fluxvla_core.robot.recording.recorded import open_recording
 from fluxvla_core.robot.recording.replay import RecordingEnded, ReplayOperator, ReplayPolicy
 from fluxvla_core.ros2 import RobotFrame
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.testing import OperatorConformance
 
 pytest.importorskip("rosbags")

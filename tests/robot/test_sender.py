@@ -10,7 +10,7 @@ from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.control.safety import Latch
 from fluxvla_core.control.sender import CommandSender
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 ONE = EmbodimentSpec("one", (Joint("j", "rad", -1.0, 1.0, 2.0, 10.0),), (), 50.0)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from fluxvla_core.errors import CheckpointError, ConfigError, LoadFailed, SpecMismatch, UsageError
-from fluxvla_core.spec.embodiment import Camera, Joint
+from fluxvla_core.spec import Camera, Joint
 
 
 def refused(bench, kind, match, **arguments):

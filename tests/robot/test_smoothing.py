@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 ELBOW = Joint("elbow", "rad", -1.0, 1.5, 2.0, 10.0, jerk=100.0)
 SLIDE = Joint("slide", "m", 0.0, 0.4, 0.5, 3.0, kind="prismatic")

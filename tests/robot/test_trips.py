@@ -11,7 +11,7 @@ from fluxvla_core.control.chunks import check_beginning, check_chunk
 from fluxvla_core.control.safety import Latch, SafetySettings, Trip
 from fluxvla_core.control.tracking import TrackingWatch, action_columns
 from fluxvla_core.errors import SafetyStop
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
     "arm",

@@ -124,3 +124,6 @@ def test_what_a_command_ends_with():
     assert isinstance(ended, RunFailed)
     assert ended.exit_code == 1
     assert str(ended) == "stopped by SIGTERM; the robot was stopped"
+    ended = Interrupted(signal.SIGINT).final("Arm.stop did not return within 5 s")
+    failed = "stopped by Ctrl-C; stopping the robot failed: Arm.stop did not return within 5 s"
+    assert str(ended) == failed

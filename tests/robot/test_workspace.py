@@ -11,7 +11,7 @@ from fluxvla_core.control.filters import WorkspaceBox
 from fluxvla_core.control.kinematics import Chain
 from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.errors import ConfigError, SafetyStop
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 NAMES = ("pan", "lift", "elbow")
 # A vertical shoulder, then two pitching links: 0.3 m and 0.3 m from a base 0.2 m high.

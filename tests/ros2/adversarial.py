@@ -19,7 +19,7 @@ from fluxvla_core.control.filters import LowPass, SnapGripper
 from fluxvla_core.control.joiners import METHODS
 from fluxvla_core.control.tracking import HOLD_REACH
 from fluxvla_core.ros2.stop_motion import PATIENCE_S, braking_commands, hold_target
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 ARM = EmbodimentSpec(
     "arm",

@@ -18,7 +18,7 @@ from fluxvla_core.ros2 import (
     joints,
     message_class,
 )
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 NAMES = ("elbow", "wrist", "grip")
 CAM = Camera("cam", 48, 64)

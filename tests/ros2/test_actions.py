@@ -7,7 +7,7 @@ import pytest
 
 from fluxvla_core.errors import Rejected
 from fluxvla_core.ros2 import checked_action
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec(
     "arm",

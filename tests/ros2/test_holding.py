@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.ros2.stop_motion import Motion, braking_commands, hold_target
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec(
     "arm",

@@ -166,7 +166,7 @@ def test_joint_states_that_fall_silent_are_noticed_in_both(both, robot):
 
 
 def test_the_part_without_cameras_needs_no_camera_and_no_image_type(parts, drivers, monkeypatch):
-    from fluxvla_core.ros2 import operator as module
+    from fluxvla_core.ros2 import startup as module
 
     asked, import_it = [], module.message_class
     monkeypatch.setattr(module, "message_class", lambda t: asked.append(t) or import_it(t))
@@ -222,7 +222,7 @@ def test_a_part_does_what_it_has_and_refuses_the_rest(part):
 
 
 def test_deprecated_names_still_work():
-    with pytest.warns(DeprecationWarning, match="Old.admit is deprecated, call it check_command"):
+    with pytest.warns(DeprecationWarning, match="Old.admit is deprecated, name it check_command"):
 
         class Old(Wired):
             def admit(self, action):

@@ -9,7 +9,7 @@ import pytest
 
 from fluxvla_core.ros2 import COMPRESSED_IMAGE, IMAGE, Connection, camera_stream, message_class
 from fluxvla_core.ros2.startup import ReceptionStats, is_trap, large_frames_profile
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 CAMERA = {"topic": "/cam", "message": IMAGE, "hz": 30, "height": 480, "width": 640}
 

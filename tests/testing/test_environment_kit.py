@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.evaluation import Step
-from fluxvla_core.plugins.files import load_plugin_files
-from fluxvla_core.plugins.registry import ENVIRONMENTS
+from fluxvla_core.plugins.registry import ENVIRONMENTS, load_plugin_files
 from fluxvla_core.testing import EnvironmentConformance
 from tests.evaluation.conftest import WALKING
 

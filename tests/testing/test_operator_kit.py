@@ -14,7 +14,7 @@ from fluxvla_core.testing import OperatorConformance
 GOOD = """
 import time
 import numpy as np
-from fluxvla_core.contracts import Frame
+from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.errors import NotReady, Rejected
 from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from fluxvla_core.plugins.registry import OPERATORS

@@ -10,12 +10,12 @@ from contextlib import ExitStack
 import pytest
 
 from fluxvla_core.testing import ros_domains
-from fluxvla_core.testing.ros_domains import DOMAINS, claimed_domain
+from fluxvla_core.testing.ros2 import DOMAINS, claimed_domain
 
 CLAIM = """
 import sys
 from pathlib import Path
-from fluxvla_core.testing.ros_domains import claimed_domain
+from fluxvla_core.testing.ros2 import claimed_domain
 with claimed_domain(Path(sys.argv[1])) as domain:
     print(domain, flush=True)
     sys.stdin.read()

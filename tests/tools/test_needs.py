@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tools import needs, skipped
+from tools import needs, stages
 from tools.needs import Need
 
 ROOT = Path(__file__).parents[2]
@@ -83,7 +83,7 @@ def test_the_session_of_the_tests_asks_for_it_before_it_runs_any() -> None:
 
 def test_skips_of_several_runs_are_one_list(tmp_path: Path) -> None:
     place = tmp_path / "skipped.jsonl"
-    assert skipped.summary(place) == ["nothing was skipped"]
+    assert stages.summary(place) == ["nothing was skipped"]
     test = tmp_path / "test_few.py"
     test.write_text(
         "import pytest\n"
@@ -100,12 +100,12 @@ def test_skips_of_several_runs_are_one_list(tmp_path: Path) -> None:
         done = subprocess.run(
             [*command, *more],
             cwd=tmp_path,
-            env={**environment, skipped.FILE: str(place), "PYTHONPATH": str(ROOT)},
+            env={**environment, stages.SKIPPED: str(place), "PYTHONPATH": str(ROOT)},
             capture_output=True,
             text=True,
         )
         assert done.returncode == 0, done.stdout + done.stderr
-    first, second = skipped.summary(place)
+    first, second = stages.summary(place)
     assert first.startswith("4 skipped: no gizmo (")
     assert second.startswith("2 skipped: not today (")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.testing.training import (
     TinyDataset,
     tiny_config,

@@ -17,7 +17,7 @@ from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, FluxError, RunFailed, UsageError
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.policies.loading import load_policy
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from fluxvla_core.training.export import export
 from fluxvla_core.training.weights import left_out
 

@@ -25,7 +25,7 @@ from fluxvla_core.models import (
 )
 from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS, VLAS
 from fluxvla_core.policies.loading import load_policy
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import TinyDataset, tiny_config
 from fluxvla_core.training.export import embodiment_in, export_foreign, import_checkpoint
 from fluxvla_core.training.formats import formats, read_foreign, telling_families

@@ -9,7 +9,7 @@ from torch import nn
 
 from fluxvla_core import build_dataset_from_cfg
 from fluxvla_core.build import RunContext, build_runner_from_cfg
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
@@ -17,7 +17,7 @@ from fluxvla_core.data.sampler import EpochSampler
 from fluxvla_core.data.transforms.images import SCALE
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.plugins.registry import VLAS
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from fluxvla_core.testing.training import differences, unflushed
 from fluxvla_core.training import batches
 

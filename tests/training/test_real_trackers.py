@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.training import trackers
 from fluxvla_core.training.trackers import open_tracker
 
@@ -65,7 +65,7 @@ def test_tensorboard_of_a_run_that_begins_anew(tmp_path):
 PROGRAM = """
 import sys
 from pathlib import Path
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.training.trackers import open_tracker
 
 class Loud(SilentReporter):

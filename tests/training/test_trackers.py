@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.training.trackers import check_trackers, open_tracker
 

@@ -65,7 +65,7 @@ def next_steps(size: Size, places: Places, steps: int) -> list[Next]:
     ]
 
 
-def told(steps: list[Next]) -> list[str]:
+def listing(steps: list[Next]) -> list[str]:
     """The lines that end a demo."""
     width = max(len(step.title) for step in steps)
     lines = []

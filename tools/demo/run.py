@@ -1,4 +1,4 @@
-"""Run the stages, keep what is done, say where it is and in the end what it made."""
+"""Run the stages of the demo, except finished ones, and list the results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from tools import shell
 from tools.demo import outcome, stages
 from tools.demo.journal import Entry, Journal, key_of
-from tools.demo.next_steps import next_steps, told
+from tools.demo.next_steps import listing, next_steps
 from tools.demo.outcome import clock
 from tools.demo.sizes import Size, affordable_steps, expected_s, left_s
 from tools.demo.stages import Places, Stage
@@ -153,7 +153,7 @@ class Demo:
                 shutil.rmtree(path)
 
     def _write_stages(self) -> None:
-        """What the report shows of where the time went."""
+        """Write the duration of each stage, for the report."""
         rows = [
             {"name": name, "seconds": entry.seconds, "command": entry.command}
             for name, entry in self.journal.entries.items()
@@ -180,6 +180,6 @@ class Demo:
         activate = Path(sys.prefix) / "bin" / "activate"
         first = f", after: source {os.path.relpath(activate)}" if activate.is_file() else ""
         self._say(f"What to do next{first}")
-        for line in told(next_steps(self.size, places, steps)):
+        for line in listing(next_steps(self.size, places, steps)):
             self._say(line)
         sys.stdout.flush()

@@ -1,1 +1,1 @@
-"""The documentation as a site: pages that are generated, links, the check of what was built."""
+"""The documentation as a site: generated pages, links, the check of the built site."""

@@ -16,7 +16,7 @@ QUIET = {"NO_MKDOCS_2_WARNING": "1"}
 
 
 def build(site: Path = SITE) -> list[str]:
-    """Build the site into ``site``; what is wrong with it.
+    """Build the site into ``site``; returns its problems.
 
     Raises:
         subprocess.CalledProcessError: mkdocs found something.

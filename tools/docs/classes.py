@@ -80,7 +80,7 @@ def render_registries(root: Path) -> str:
 
 
 def render_classes(root: Path, row: RegistryRow) -> str:
-    """The classes of one registry: what a config may say to each."""
+    """The classes of one registry, with the keys of each."""
     known = pages(root)
     parts = [
         f"# {title_of(row)}",

@@ -1,4 +1,4 @@
-"""The reference of the command line: what each command takes, as its ``--help`` says it."""
+"""The reference of the command line: each command's arguments, from its ``--help``."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _usage(parser: argparse.ArgumentParser) -> str:
 
 
 def _option(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
-    """An item of a list: the argument as it is typed, and what it is."""
+    """An item of a list: the argument as it is typed, and its meaning."""
     metavar = action.metavar
     if metavar is None and action.choices is not None:
         metavar = "{" + ",".join(map(str, action.choices)) + "}"

@@ -33,7 +33,7 @@ class Page:
     Args:
         name: of its file, without ``.md``.
         title: its heading.
-        about: what stands below it.
+        about: the text below it.
         classes: module below ``fluxvla_core`` -> classes of it; contracts, or data classes.
         only: class -> the methods that are shown of it; all public ones by default.
     """
@@ -161,7 +161,7 @@ PAGES = (
         "The data that the contracts exchange.",
         {
             _CONTRACTS.format("frame"): ("Frame", "Observation"),
-            "spec/embodiment.py": ("EmbodimentSpec", "Joint", "Camera"),
+            "spec.py": ("EmbodimentSpec", "Joint", "Camera"),
         },
     ),
 )

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def find_sources() -> None:
-    """Let what is not installed be imported: the core, and what the commands of plugins need."""
+    """Make the core importable, and the imports of plugins' commands, without installing them."""
     for folder in (ROOT, ROOT / "src", *sorted((ROOT / "plugins").glob("*/src"))):
         if str(folder) not in sys.path:
             sys.path.append(str(folder))
@@ -63,7 +63,7 @@ def expanded(nav: list[Any], known: list[str]) -> list[Any]:
 
 
 def on_config(config: Any) -> Any:
-    """Fill in the parts of the navigation that follow from what is in the repository."""
+    """Fill in the parts of the navigation that list files of the repository."""
     known = [page for page, _ in generated()] + list(pages.pages(ROOT).values())
     config.nav = expanded(config.nav, known)
     return config

@@ -15,7 +15,7 @@ _NOT_LOADED = {"canonical", "next", "prev", "alternate"}
 
 @dataclass
 class Html(HTMLParser):
-    """What matters of one page: anchors, links, and what is loaded with it."""
+    """Anchors, links and loaded resources of one page."""
 
     anchors: set[str] = field(default_factory=set)
     links: list[str] = field(default_factory=list)

@@ -23,7 +23,7 @@ _CONTRACTS = "src/fluxvla_core/contracts"
 _REFERENCE = {
     f"{_CONTRACTS}/robot.py": "reference/operator.md",
     f"{_CONTRACTS}/frame.py": "reference/records.md",
-    "src/fluxvla_core/spec/embodiment.py": "reference/records.md",
+    "src/fluxvla_core/spec.py": "reference/records.md",
     f"{_CONTRACTS}/policy.py": "reference/policy.md",
     f"{_CONTRACTS}/environment.py": "reference/environment.md",
     f"{_CONTRACTS}/training.py": "reference/training.md",
@@ -90,7 +90,7 @@ def shown(path: str, text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """``text`` of a program as Markdown: what is in ``<>`` outside of code is no HTML."""
+    """``text`` as Markdown: ``<>`` outside of code is escaped."""
     return _CODE.sub(lambda found: found["code"] or found[0].replace("<", "&lt;"), text)
 
 

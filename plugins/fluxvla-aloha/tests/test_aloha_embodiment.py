@@ -13,7 +13,7 @@ from fluxvla_aloha.embodiment import GRIPPERS, aloha_spec, start_pose
 
 from fluxvla_core.errors import ConfigError, SpecMismatch
 from fluxvla_core.operators import Camera, EmbodimentSpec
-from fluxvla_core.spec.embodiment import check_match
+from fluxvla_core.spec import check_match
 
 
 def test_fourteen_joints_left_before_right():

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from tools import joined_env, oracle_env, shell
-from tools.envs import Env
+from tools import oracle_env, shell
+from tools.envs import Env, join
 
 TESTS = Path(__file__).parent / "with_lerobot"
 ROOT = TESTS.parents[3]
@@ -26,7 +26,7 @@ def test_with_lerobot_044():
         lerobot = oracle_env.prepare_044(print)
     except (shell.StepFailed, OSError) as error:
         pytest.skip(f"LeRobot cannot be installed here: {str(error).strip().splitlines()[-1]}")
-    joined = joined_env.join(lerobot, Env(Path(sys.prefix)))
+    joined = join(lerobot, Env(Path(sys.prefix)))
     own = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST")}
     done = subprocess.run(
         [joined.python, "-m", "pytest", "-q", "-p", "no:cacheprovider", TESTS],

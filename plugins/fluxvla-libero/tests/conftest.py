@@ -11,7 +11,7 @@ from fluxvla_libero.require import is_installed
 
 from fluxvla_core.commands import SilentReporter
 from fluxvla_core.operators import Camera
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 MODEL = '''
 import torch

@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.cli.main import main
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.testing import training  # noqa: F401 - registers OneProcessRunner
 

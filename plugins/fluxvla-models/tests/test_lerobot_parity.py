@@ -30,7 +30,7 @@ from fluxvla_core.evaluation.policy_server import PolicyServer, ServedPolicy
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.models import load_policy
 from fluxvla_core.policies.loading import why_not_continued
-from fluxvla_core.spec.embodiment import Camera, Joint
+from fluxvla_core.spec import Camera, Joint
 from fluxvla_core.training.export import import_checkpoint
 from tests.oracles import fill
 from tests.policies.benched import DIVIDED, WHOLE, stages_of

@@ -22,7 +22,7 @@ from tokenizers.models import WordLevel
 from tokenizers.pre_tokenizers import Whitespace
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from fluxvla_core.training.weights import put_parts
 from tests.policies.benched import WHOLE, stages_measured
 

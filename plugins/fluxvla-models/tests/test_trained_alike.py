@@ -15,7 +15,7 @@ import transformers
 from fluxvla_core import EmbodimentSpec, Joint
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.testing.training import OneProcessRunner, differences, run_ranks
 from tests.training.held_memory import check_held
 

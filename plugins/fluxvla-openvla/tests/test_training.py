@@ -14,7 +14,7 @@ from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.checkpoint import latest
 from fluxvla_core.cli.main import main
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.data import sample_rng
 from fluxvla_core.testing.training import run_ranks
 

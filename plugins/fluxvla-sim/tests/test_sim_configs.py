@@ -9,7 +9,7 @@ import pytest
 from fluxvla_core import build_operator_from_cfg, build_runner_from_cfg
 from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
-from fluxvla_core.spec.embodiment import differences
+from fluxvla_core.spec import differences
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 NAMES = ("aloha_sim_transfer", "aloha_sim_ros2", "ur5e_sim_lift", "ur5e_sim_ros2")

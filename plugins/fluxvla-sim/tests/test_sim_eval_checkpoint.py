@@ -10,7 +10,7 @@ from fluxvla_sim.eval_runner import AlohaSimEvalRunner
 
 from fluxvla_core.errors import SpecMismatch
 from fluxvla_core.operators import Camera, RunContext
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 safetensors = pytest.importorskip("safetensors.torch")
 torch = pytest.importorskip("torch")

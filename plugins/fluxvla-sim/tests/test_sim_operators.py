@@ -19,7 +19,7 @@ from fluxvla_sim.ros2.operators import AlohaSimROSOperator
 from fluxvla_sim.ur.expert import URExpert
 
 from fluxvla_core.errors import ConfigError, Faulted, NotReady, Rejected
-from fluxvla_core.spec.embodiment import check_match
+from fluxvla_core.spec import check_match
 from fluxvla_core.testing import OperatorConformance
 
 SMALL = {"height": 48, "width": 64}

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     import torch
 
     from fluxvla_core.checkpoints.shards import Stored
-    from fluxvla_core.spec.embodiment import EmbodimentSpec
+    from fluxvla_core.spec import EmbodimentSpec
 
 MODEL = "model.safetensors"
 EMA = "ema.safetensors"
@@ -201,7 +201,7 @@ class Checkpoint:
 
     def embodiment(self) -> EmbodimentSpec | None:
         """The robot that it was trained for; None when the dataset named none."""
-        from fluxvla_core.spec.embodiment import EmbodimentSpec
+        from fluxvla_core.spec import EmbodimentSpec
 
         return EmbodimentSpec.from_dict(self.json(EMBODIMENT)) if self.has(EMBODIMENT) else None
 

@@ -16,7 +16,7 @@ from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.load import load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.errors import ConfigError, UsageError
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 if TYPE_CHECKING:
     from fluxvla_core.policies.local import LocalPolicy
@@ -26,7 +26,6 @@ _WIDTH, _COLUMN = 13, 22
 
 
 class BenchPolicy:
-    api = "1.0"
     help = (
         "Measure how long a policy takes from observation to chunk, by stage: that of a "
         "checkpoint, or that of a config with random weights. Observations are random, from --seed."

@@ -1,6 +1,6 @@
 """``fluxvla plugins check``: run the conformance kit that fits a class.
 
-pytest runs the kit, in this process, and says nothing itself: what the checks say is printed here.
+pytest runs the kit, silently and in this process; the results are printed here.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import io
 import os
 import sys
 import tempfile
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,7 +34,7 @@ KITS: Mapping[str, str] = {
     "transforms": "TransformConformance",
     "vlas": "ModelConformance",
 }
-"""Registry -> its kit in ``fluxvla_core.testing``; of runners, that of those that drive a robot."""
+"""Registry -> its kit in ``fluxvla_core.testing``; for runners, the kit of inference runners."""
 TRAINS, EVALUATES = "TrainRunnerConformance", "EvalRunnerConformance"
 """The kits of other runners."""
 INSTALL = "pip install 'fluxvla-core[testing]'"
@@ -48,8 +49,11 @@ class TestPlugin(fluxvla_core.testing.{kit}):
 """
 
 
+_STATES = ("ok", "skipped", "FAILED")
+
+
 class Outcome(NamedTuple):
-    """What one check said: ``ok``, ``skipped`` or ``FAILED``, and why."""
+    """The result of one check: ``ok``, ``skipped`` or ``FAILED``, and its message."""
 
     check: str
     state: str
@@ -57,7 +61,6 @@ class Outcome(NamedTuple):
 
 
 class CheckPlugin:
-    api = "1.0"
     help = (
         "Run the conformance kit that fits a class, and say in words what is wrong. An operator's "
         "kit moves the robot that it connects to, and so asks for --hardware or --simulated."
@@ -92,7 +95,7 @@ class CheckPlugin:
         add_plugin_files(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.plugins.files import load_plugin_files
+        from fluxvla_core.plugins.registry import load_plugin_files
 
         if importlib.util.find_spec("pytest") is None:
             raise UsageError("the kits need pytest, which is not installed", next=INSTALL)
@@ -113,9 +116,6 @@ class CheckPlugin:
         counts = {state: sum(o.state == state for o in found) for state in _STATES}
         say(f"{args.name}: {', '.join(f'{n} {state}' for state, n in counts.items() if n)}")
         return EXIT_FAILED if counts["FAILED"] else EXIT_DONE
-
-
-_STATES = ("ok", "skipped", "FAILED")
 
 
 def _registry_of(name: str) -> str:
@@ -141,7 +141,7 @@ def _registry_of(name: str) -> str:
 
 
 def _kit_of(registry: str, name: str, own: bool) -> str:
-    """The kit for the class; "" where only a file (``own``) can have one.
+    """The kit for the class; "" where only a file of the user's (``own``) can have one.
 
     Raises:
         UsageError: there is none.
@@ -189,7 +189,7 @@ def _kit_of_runner(name: str, cls: type, own: bool) -> str:
 
 
 def _agree(args: argparse.Namespace, registry: str) -> None:
-    """Let nothing move that nobody has agreed to.
+    """Have a person agree before the kit of an operator moves a robot.
 
     Raises:
         UsageError: an operator without one of the options, another class with one, or a person who
@@ -268,7 +268,7 @@ def _run(args: argparse.Namespace, kit: str) -> Iterator[Outcome]:
 
 
 class _Collected:
-    """A plugin of pytest that keeps what each check said.
+    """A plugin of pytest that collects the results.
 
     Args:
         name: only kits with this ``entry_point`` are run; None runs all.
@@ -302,7 +302,7 @@ class _Collected:
 
 
 def _words(report: Any) -> str:
-    """What a check said, without the values that pytest adds."""
+    """The message of a check, without the values that pytest adds."""
     if isinstance(report.longrepr, tuple):  # path, line, reason of a skip
         return str(report.longrepr[2]).removeprefix("Skipped: ")
     crash = getattr(report.longrepr, "reprcrash", None)
@@ -311,8 +311,6 @@ def _words(report: Any) -> str:
 
 
 def _lines(outcome: Outcome) -> list[str]:
-    import textwrap
-
     indent = " " * 11
     words = textwrap.wrap(outcome.words, 100, initial_indent=indent, subsequent_indent=indent)
     return [f"  {outcome.state:8} {outcome.check}", *words]

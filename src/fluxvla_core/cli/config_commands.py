@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core import atomic
-from fluxvla_core.cli.parser import Parser, add_overrides, add_plugin_files
+from fluxvla_core.cli.parser import Parser, add_config_file, add_overrides, add_plugin_files
 from fluxvla_core.cli.plan import choose_section
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.check import Use, examine
@@ -19,18 +19,17 @@ from fluxvla_core.config.load import CONFIG_FILE, load_config
 from fluxvla_core.config.overrides import apply_overrides
 from fluxvla_core.config.tree import Config, join_key, leaves
 from fluxvla_core.errors import EXIT_DONE, UsageError
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 
 class Show:
-    api = "1.0"
     help = (
         "Print the config as it resolves, one key a line, as --set takes them. A .py config is "
         "executed."
     )
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("file", help="a .py, .toml or config.resolved.json")
+        add_config_file(parser)
         parser.add_argument("--origin", action="store_true", help="add where each key is written")
         add_overrides(parser)
 
@@ -42,14 +41,13 @@ class Show:
 
 
 class Check:
-    api = "1.0"
     help = (
         "Check a config against the classes that it names: types, unknown and missing keys, all "
         "problems at once. No plugin is imported; a .py config is executed."
     )
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("file", help="a .py, .toml or config.resolved.json")
+        add_config_file(parser)
         parser.once("--section", help="only the plugins of this section have to be installed")
         add_overrides(parser)
         add_plugin_files(parser)
@@ -69,7 +67,6 @@ class Check:
 
 
 class Diff:
-    api = "1.0"
     help = (
         "Compare two configs as they resolve: keys that were removed (-), added (+) or changed "
         "(both), each with its file and line. Exit code 0: equal, 1: different, 2: one cannot be "
@@ -82,18 +79,14 @@ class Diff:
         parser.add_argument("new", metavar="B", help="the same, to compare with A")
 
     def run(self, args: argparse.Namespace) -> int:
-        changes = differences(load_config(config_of(args.old)), load_config(config_of(args.new)))
+        old, new = (load_config(_config_of(Path(name))) for name in (args.old, args.new))
+        changes = differences(old, new)
         for line in changed(changes):
             say(line)
-        return DIFFERENT if changes else EXIT_DONE
-
-
-DIFFERENT = 1
-"""Exit code of ``config diff``, as of diff(1)."""
+        return 1 if changes else EXIT_DONE  # as diff(1)
 
 
 class Schema:
-    api = "1.0"
     help = (
         "Print a JSON Schema (draft 2020-12) of the configs that what is installed can run, with "
         "which an editor completes and checks TOML. No plugin is imported."
@@ -119,22 +112,18 @@ class Schema:
         return EXIT_DONE
 
 
-def config_of(name: str) -> Path:
-    """The config that a file, or a folder of a run, stands for."""
-    path = Path(name)
+def _config_of(path: Path) -> Path:
+    """The config of a work dir or checkpoint; any other path as it is."""
     inside = path / CONFIG_FILE
     return inside if inside.is_file() else path
 
 
 def changed(changes: Iterable[Change]) -> list[str]:
     """``- key = value`` and ``+ key = value`` lines, each with its ``# file:line``."""
-    sides: list[tuple[str, Side]] = []
-    for change in changes:
-        sides += [("-", change.old)] if change.old else []
-        sides += [("+", change.new)] if change.new else []
+    pairs = [pair for one in changes for pair in (("-", one.old), ("+", one.new))]
+    sides = [(sign, side) for sign, side in pairs if side is not None]
     texts = [f"{sign} {side.key} = {literal(side.value)}" for sign, side in sides]
-    width = min(max(map(len, texts), default=0), 60)
-    return [f"{text:{width}}  # {side.where}" for text, (_, side) in zip(texts, sides, strict=True)]
+    return _with_places(texts, [side.where for _, side in sides])
 
 
 def listing(config: Config, origin: bool) -> list[str]:
@@ -143,8 +132,11 @@ def listing(config: Config, origin: bool) -> list[str]:
     texts = [f"{key} = {literal(value)}" for key, value in found]
     if not origin:
         return texts
+    return _with_places(texts, [_places(config, key, value) for key, value in found])
+
+
+def _with_places(texts: list[str], places: list[str]) -> list[str]:
     width = min(max(map(len, texts), default=0), 60)
-    places = [_places(config, key, value) for key, value in found]
     return [f"{text:{width}}  # {place}" for text, place in zip(texts, places, strict=True)]
 
 

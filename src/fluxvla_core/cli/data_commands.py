@@ -10,26 +10,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from fluxvla_core.cli.parser import Parser, add_plugin_files, positive
+from fluxvla_core.cli.parser import Parser, add_json, add_log_format, add_plugin_files, positive
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
+    from fluxvla_core.cli.reporters import RunReporter
     from fluxvla_core.evaluation.collect import Collection
-
-DIR = "a LeRobot dataset: the folder that holds meta/"
 
 
 class Inspect:
-    api = "1.0"
     help = (
         "Print what a dataset holds: version, robot, episodes, cameras, vectors, instructions. "
         "Reads its tables and decodes nothing."
     )
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("dataset", metavar="DIR", help=DIR)
-        parser.add_argument("--json", action="store_true", help="print JSON")
+        _add_dataset(parser)
+        add_json(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.data.inspection import describe, format_description
@@ -40,20 +38,19 @@ class Inspect:
 
 
 class Validate:
-    api = "1.0"
     help = (
         "Read every row and decode every frame of a dataset; exit code 2 and what is wrong, file "
         "by file, or 0."
     )
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("dataset", metavar="DIR", help=DIR)
-        _log_format(parser)
+        _add_dataset(parser)
+        add_log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.data.inspection import validate
 
-        with _reporter(args.log_format, sys.stdout) as reporter:
+        with _reporter(args.log_format) as reporter:
             warnings = validate(Path(args.dataset), reporter)
             warned = f", {len(warnings)} warnings" if warnings else ""
             reporter.info(f"nothing is wrong with {args.dataset}{warned}")
@@ -61,18 +58,17 @@ class Validate:
 
 
 class Stats:
-    api = "1.0"
     help = (
         "Print exact statistics of a dataset: every vector, and with --pixels every camera. "
         "Quantiles are of the data itself."
     )
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("dataset", metavar="DIR", help=DIR)
+        _add_dataset(parser)
         parser.add_argument("--pixels", action="store_true", help="decode and count all frames")
-        parser.add_argument("--json", action="store_true", help="print JSON")
+        add_json(parser)
         parser.add_argument("--write", action="store_true", help="put them into meta/stats.json")
-        _log_format(parser)
+        add_log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.data.inspection import (
@@ -82,7 +78,7 @@ class Stats:
         )
         from fluxvla_core.data.statistics import as_lists
 
-        # The statistics are what comes out; how far they are is said on stderr.
+        # stdout is for the statistics alone.
         with _reporter(args.log_format, sys.stderr) as reporter:
             meta, stats = dataset_statistics(Path(args.dataset), args.pixels, reporter)
             if args.write:
@@ -95,7 +91,6 @@ class Stats:
 
 
 class Convert:
-    api = "1.0"
     help = (
         "Write a dataset of LeRobot v3.0: from one of v2.0 or v2.1, whose video is copied, not "
         "encoded again, or from episodes that were recorded with fluxvla run --record."
@@ -118,14 +113,14 @@ class Convert:
         parser.add_argument(
             "--successes", action="store_true", help="only recordings that succeeded"
         )
-        _log_format(parser)
+        add_log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.data.convert import convert
         from fluxvla_core.robot.recording.to_dataset import recordings_to_dataset
 
         datasets = [source for source in args.sources if (Path(source) / "meta").is_dir()]
-        with _reporter(args.log_format, sys.stdout) as reporter:
+        with _reporter(args.log_format) as reporter:
             if not datasets:
                 found = recordings_to_dataset(
                     args.sources, args.out, args.fps, args.successes, reporter
@@ -142,7 +137,6 @@ class Convert:
 
 
 class Finish:
-    api = "1.0"
     help = (
         "Finish recordings that were cut short (kill -9, a full disk), so that ROS tools open "
         "them. FluxVLA itself reads them as they are."
@@ -162,17 +156,20 @@ class Finish:
         return 0
 
 
-def _log_format(parser: Parser) -> None:
-    parser.once(
-        "--log-format", choices=("text", "json"), default="text", help="format of progress messages"
+def _add_dataset(parser: Parser) -> None:
+    parser.add_argument(
+        "dataset", metavar="DIR", help="a LeRobot dataset: the folder that holds meta/"
     )
 
 
 @contextmanager
-def _reporter(log_format: str, stream: TextIO) -> Iterator[Any]:
-    from fluxvla_core.cli.choose_reporter import make_reporter
+def _reporter(
+    log_format: str, stream: TextIO | None = None, heartbeat: bool = False
+) -> Iterator[RunReporter]:
+    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
 
-    reporter = make_reporter(log_format, stream)
+    made = make_reporter(log_format, stream)
+    reporter = KeepAliveReporter(made) if heartbeat else made
     try:
         yield reporter
     finally:
@@ -183,7 +180,6 @@ _SIDES = {"env": "environment", "policy": "policy"}
 
 
 class Collect:
-    api = "1.0"
     help = (
         "Record demonstrations of a policy in an environment, the environment's scripted expert by "
         "default, as a LeRobot v3.0 dataset with videos."
@@ -203,12 +199,9 @@ class Collect:
             "--seed", type=int, default=10_000, help="seed of the first episode (default 10000)"
         )
         parser.once("--cameras", nargs="+", metavar="NAME", help="cameras to record (default: all)")
-        parser.once(
-            "--height", type=positive, help="height of the images in pixels (default: the camera's)"
-        )
-        parser.once(
-            "--width", type=positive, help="width of the images in pixels (default: the camera's)"
-        )
+        for side in ("height", "width"):
+            about = f"{side} of the images in pixels (default: the camera's)"
+            parser.once(f"--{side}", type=positive, help=about)
         parser.once(
             "--workers", type=positive, default=2, metavar="N", help="worker processes (default 2)"
         )
@@ -227,17 +220,12 @@ class Collect:
             help="an argument: env.NAME=VALUE or policy.NAME=VALUE (a TOML value); repeatable",
         )
         add_plugin_files(parser)
-        parser.once(
-            "--log-format",
-            choices=("text", "json"),
-            default="text",
-            help="format of progress messages",
-        )
+        add_log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.config.hints import whole_options
+        from fluxvla_core.config.overrides import whole_options
         from fluxvla_core.evaluation.collect import Collection
-        from fluxvla_core.plugins.files import load_plugin_files
+        from fluxvla_core.plugins.registry import load_plugin_files
 
         load_plugin_files(args.plugin_files)
         tables = arguments(args.env, args.policy, args.arguments)
@@ -259,26 +247,22 @@ class Collect:
 
 
 def collect_demonstrations(collection: Collection, args: argparse.Namespace) -> None:
-    """Collect demonstrations as ``args`` says (out, workers, resume, log_format), with progress."""
-    from fluxvla_core.cli.choose_reporter import make_reporter
-    from fluxvla_core.cli.reporters import KeepAliveReporter
+    """Collect demonstrations, with progress; ``args``: out, workers, resume, log_format."""
     from fluxvla_core.evaluation.collect import collect
 
-    reporter = KeepAliveReporter(make_reporter(args.log_format))
-    try:
+    with _reporter(args.log_format, heartbeat=True) as reporter:
         reporter.info(f"collecting {collection.episodes} demonstrations into {Path(args.out)}")
-        results = collect(args.out, collection, args.workers, args.resume, reporter)
+        try:
+            results = collect(args.out, collection, args.workers, args.resume, reporter)
+        except KeyboardInterrupt as error:
+            raise KeyboardInterrupt(
+                "finished episodes are kept\n  next: run the same command again with --resume"
+            ) from error
         again = f", {results['retried']} tried again" if results["retried"] else ""
         reporter.info(
             f"{results['episodes']} episodes, {results['frames']} new frames{again} in "
             f"{results['seconds']:.0f} s: {results['frames_per_s']:.1f} frames/s"
         )
-    except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(
-            "finished episodes are kept\n  next: run the same command again with --resume"
-        ) from error
-    finally:
-        reporter.close()
 
 
 def arguments(env: str, policy: str, settings: Sequence[str]) -> dict[str, Any]:

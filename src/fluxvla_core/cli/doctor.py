@@ -1,4 +1,4 @@
-"""``fluxvla plugins doctor``: what is wrong with the installation, and facts about the machine.
+"""``fluxvla plugins doctor``: problems of the installation, and facts about the machine.
 
 Metadata and sources are read first, which takes a second; then each plugin is imported, in
 processes that may break.
@@ -17,7 +17,7 @@ from typing import Literal
 from packaging.requirements import InvalidRequirement, Requirement
 
 from fluxvla_core.cli.main import RESERVED, STRICT
-from fluxvla_core.cli.parser import Parser, positive
+from fluxvla_core.cli.parser import Parser, add_json, positive
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, PluginError
 from fluxvla_core.plugins import _metadata
@@ -47,9 +47,9 @@ class Finding:
     """One thing that the doctor found.
 
     Args:
-        kind: what it is about.
+        kind: its subject.
         problem: whether something does not work; else it is a note.
-        distribution: whose it is; None if that cannot be known, or it is several's.
+        distribution: the one concerned; None if unknown, or several are.
         text: the finding and what to do, for people.
     """
 
@@ -60,12 +60,11 @@ class Finding:
 
 
 class Doctor:
-    api = "1.0"
     help = (
         "Look for distributions that cannot be read, names that collide, requirements that do not "
         "hold, unknown groups, syntax errors, and entry points to nothing; then import every "
         "plugin, each distribution in a process of its own, and check its classes against their "
-        "contracts. Then tell what the machine has: torch, CUDA, ROS 2, rendering, disks, memory."
+        "contracts. Then list what the machine has: torch, CUDA, ROS 2, rendering, disks, memory."
     )
 
     def add_arguments(self, parser: Parser) -> None:
@@ -79,7 +78,7 @@ class Doctor:
             metavar="SECONDS",
             help=f"how long one import may take (default {IMPORT_LIMIT_S})",
         )
-        parser.add_argument("--json", action="store_true", help="print JSON")
+        add_json(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.cli import machine
@@ -123,7 +122,7 @@ def _line(finding: Finding) -> str:
 
 
 def findings(no_import: bool, limit_s: float) -> Iterator[Finding]:
-    """Everything that is wrong with, or remarkable about, what is installed, as it is found.
+    """Problems of everything that is installed, as they are found.
 
     Args:
         limit_s: seconds that one import may take.
@@ -180,8 +179,6 @@ def _requirements() -> Iterator[Finding]:
 
     The core's own are looked at where a plugin asks for one of its extras.
     """
-    from fluxvla_core.cli.doctor import unmet_requirements
-
     seen: set[str] = set()
     for plugin in _read_groups():
         if plugin.dist not in seen and not is_core(plugin):
@@ -230,7 +227,7 @@ def _unmet(
     for text in requires:
         try:
             wanted = Requirement(text)
-        except InvalidRequirement:  # ``unmet`` tells this one
+        except InvalidRequirement:  # reported by ``plugins.load.unmet``
             continue
         marker = wanted.marker
         if marker is not None and not any(marker.evaluate({"extra": extra}) for extra in extras):

@@ -1,4 +1,4 @@
-"""The output of ``fluxvla run --dry-run``: the config, and what can be known of a training."""
+"""The output of ``fluxvla run --dry-run``: the config, and shapes and memory of a training."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from fluxvla_core.cli.plan import Plan
 
 if TYPE_CHECKING:
     from fluxvla_core.errors import FluxError
-    from fluxvla_core.spec.embodiment import EmbodimentSpec
-    from fluxvla_core.training.footprint import Footprint
+    from fluxvla_core.spec import EmbodimentSpec
     from fluxvla_core.training.rehearsal import Rehearsal
 
 _GB = 1e9
@@ -32,7 +31,7 @@ _ROWS = {
 
 
 def outline(plan: Plan, log_format: str, nproc: int | None) -> tuple[str, FluxError | None]:
-    """What ``--dry-run`` prints, for people or as one JSON object; what the run would end with.
+    """The text that ``--dry-run`` prints, and the error that the run would end with.
 
     Args:
         log_format: ``text`` or ``json``.
@@ -58,7 +57,7 @@ def outline(plan: Plan, log_format: str, nproc: int | None) -> tuple[str, FluxEr
 
 
 def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
-    """What is known of the training; a line that says why nothing is."""
+    """The training, built without memory; or a line that says why it cannot be."""
     from fluxvla_core.build import RunContext
     from fluxvla_core.cli.reporters import heartbeat
     from fluxvla_core.config.tree import freeze
@@ -94,38 +93,37 @@ def _as_json(plan: Plan, rehearsal: Rehearsal | str | None) -> dict[str, Any]:
         return {**record, "notes": [rehearsal]}
     if rehearsal is None:
         return record
-    data, robot = rehearsal.data, rehearsal.robot
+    from fluxvla_core.training.footprint import LEFT_OUT
+
+    data, robot, shape = rehearsal.data, rehearsal.robot, rehearsal.action_shape
+    dataset = data and {
+        "samples": None if data.dataset is None else len(data.dataset),
+        "states": data.states,
+        "actions": data.actions,
+        "cameras": {name: list(size or ()) or None for name, size in data.cameras.items()},
+    }
     pipeline = {
-        "dataset": None
-        if data is None
-        else {
-            "samples": None if data.dataset is None else len(data.dataset),
-            "states": data.states,
-            "actions": data.actions,
-            "cameras": {name: list(size or ()) or None for name, size in data.cameras.items()},
-        },
+        "dataset": dataset,
         "batch": {k: {"shape": list(s), "dtype": d} for k, (s, d) in rehearsal.batch.items()},
         "model": {
             "type": rehearsal.model,
             "parameters": rehearsal.parameters,
             "trained": rehearsal.trained,
-            "action_shape": None
-            if rehearsal.action_shape is None
-            else list(rehearsal.action_shape),
+            "action_shape": None if shape is None else list(shape),
         },
         "robot": None if robot is None else robot.to_dict(),
     }
     memory = {
         "precision": rehearsal.precision,
         "activations_known": rehearsal.activations_known,
-        "left_out": list(_left_out()),
+        "left_out": list(LEFT_OUT),
         "bytes": {str(count): one.to_dict() for count, one in rehearsal.memory.items()},
     }
     return {**record, "pipeline": pipeline, "memory": memory, "notes": rehearsal.notes}
 
 
 def _pipeline(rehearsal: Rehearsal) -> list[str]:
-    """The way of the shapes from the data to the robot, a line each."""
+    """Shapes from the data to the robot, a line each."""
     rows: list[tuple[str, str]] = []
     data = rehearsal.data
     if data is not None:
@@ -190,13 +188,15 @@ def _memory(found: Rehearsal) -> list[str]:
     """The table of memory: a column for each number of processes, at most 80 characters."""
     if not found.memory:
         return []
+    from fluxvla_core.training.footprint import LEFT_OUT
+
     counts = list(found.memory)
     lines = [
         f"memory of each process in GB (1e9 bytes), computing in {found.precision}:",
         f"  {'processes':20}" + "".join(f"{count:>11}" for count in counts),
     ]
     for name, title in _ROWS.items():
-        values = [_value(one, name) for one in found.memory.values()]
+        values = [one.to_dict()[name] for one in found.memory.values()]
         unknown = name == "activations" and not found.activations_known
         if max(values) < _GB / 2e3 and not unknown and name != "total":
             continue
@@ -204,23 +204,10 @@ def _memory(found: Rehearsal) -> list[str]:
         lines.append(f"  {title:20}{cells}")
     together = [count * one.total for count, one in found.memory.items()]
     lines.append(f"  {'all processes':20}" + "".join(f"{gigabytes(v):>11}" for v in together))
-    return [*lines, *_wrapped(f"Not counted: {', '.join(_left_out())}.")]
+    note = f"Not counted: {', '.join(LEFT_OUT)}."
+    return [*lines, *textwrap.wrap(note, _COLUMNS, initial_indent="  ", subsequent_indent="  ")]
 
 
 def gigabytes(count: int) -> str:
     """Bytes as GB of two decimals; three where there are few."""
     return f"{count / _GB:.3f}" if count < _GB else f"{count / _GB:,.2f}"
-
-
-def _value(one: Footprint, name: str) -> int:
-    return one.to_dict()[name]
-
-
-def _left_out() -> tuple[str, ...]:
-    from fluxvla_core.training.footprint import LEFT_OUT
-
-    return LEFT_OUT
-
-
-def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, _COLUMNS, initial_indent="  ", subsequent_indent="  ")

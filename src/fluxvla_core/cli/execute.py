@@ -14,7 +14,7 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.cli.plan import Plan
 from fluxvla_core.config.load import CONFIG_FILE
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.signals import handling, requests_to_stop
 
@@ -26,10 +26,9 @@ def execute(plan: Plan, args: argparse.Namespace) -> int:
         The signal that asked to stop it when it was done, or 0.
     """
     from fluxvla_core.build import RunContext, build_runner_from_cfg
-    from fluxvla_core.cli.choose_reporter import make_reporter
-    from fluxvla_core.cli.reporters import KeepAliveReporter
+    from fluxvla_core.cli.reporters import KeepAliveReporter, make_reporter
     from fluxvla_core.config.tree import freeze
-    from fluxvla_core.contracts.reporter import SilentReporter
+    from fluxvla_core.contracts.runner import SilentReporter
 
     context = RunContext(
         config=freeze(plan.config.tree),
@@ -72,7 +71,7 @@ def execute(plan: Plan, args: argparse.Namespace) -> int:
 
 
 def _claimed(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
-    """A training has its work dir for itself, from before it leaves the first file there."""
+    """Lock the work dir of a training, before its first file is written there."""
     if not plan.trains:
         return nullcontext()
     from fluxvla_core.checkpoints.lock import lock_work_dir
@@ -91,25 +90,25 @@ def _run_section(
             runner keeps them beside its results (``Runner.keeps_config``).
 
     Returns:
-        What the section gave, and the signal that asked to stop it when it was done, or 0.
+        The runner's result, and the signal that asked to stop it when it was done, or 0.
     """
-    from fluxvla_core.config.hints import whole_options
+    from fluxvla_core.config.overrides import whole_options
+    from fluxvla_core.contracts.check import is_train_runner
+    from fluxvla_core.contracts.runner import Runner
 
     with whole_options(plan.config.tree, plan.section):
-        return _driven(plan, build, context, own_records)
-
-
-def _driven(plan: Plan, build: Any, context: Any, own_records: bool) -> tuple[Any, int]:
-    from fluxvla_core.contracts import Runner, TrainRunner
-    from fluxvla_core.contracts.check import is_train_runner
-
-    runner = build(context.config[plan.section], context)
-    if not is_train_runner(type(runner)):
+        runner = build(context.config[plan.section], context)
+        if is_train_runner(type(runner)):
+            return _train(plan, runner, context)
         if own_records and not Runner.adapt(runner).keeps_config:
             _write_records(plan, plan.work_dir / plan.section)
         runner.run_setup()
         return runner.run(), 0
+
+
+def _train(plan: Plan, runner: Any, context: Any) -> tuple[Any, int]:
     from fluxvla_core.build import build_dataset_from_cfg
+    from fluxvla_core.contracts.runner import TrainRunner
     from fluxvla_core.errors import located
 
     with located(context.where("train_dataloader.dataset")):
@@ -138,7 +137,7 @@ def _leave_records(plan: Plan) -> bool:
 
 def _write_records(plan: Plan, folder: Path) -> None:
     from fluxvla_core import atomic
-    from fluxvla_core.config.snapshot import ENVIRONMENT_FILE, environment, write_resolved
+    from fluxvla_core.config.load import ENVIRONMENT_FILE, environment, write_resolved
 
     folder.mkdir(parents=True, exist_ok=True)
     write_resolved(folder / CONFIG_FILE, plan.config)
@@ -152,16 +151,16 @@ def folders_to_make(plan: Plan) -> list[Path]:
 
 
 def remove_folders(made: list[Path]) -> None:
-    """Remove what a run that was refused has made; a folder with more in it stays."""
+    """Remove the folders of a run that was refused; one with other files in it stays."""
     with suppress(OSError):
         for folder in made:
             _remove_records(folder)
 
 
 def _remove_records(folder: Path) -> None:
-    """Remove a folder in which nothing is but what every run leaves as it begins."""
+    """Remove a folder that holds only the files that every run writes as it begins."""
     from fluxvla_core.checkpoints.lock import LOCK
-    from fluxvla_core.config.snapshot import ENVIRONMENT_FILE
+    from fluxvla_core.config.load import ENVIRONMENT_FILE
 
     inside = list(folder.iterdir()) if folder.is_dir() else []
     if {path.name for path in inside} <= {CONFIG_FILE, ENVIRONMENT_FILE, LOCK}:
@@ -177,9 +176,9 @@ class _Terminated(BaseException):
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """They unwind the stack as Ctrl-C does, so that everything that was opened is closed.
+    """SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that everything is closed.
 
-    Loops that know better (a robot's, a training's) take the signal over while they run.
+    A robot's or a training's loop handles the signals itself while it runs.
     """
 
     def handle(number: int, frame: Any) -> None:

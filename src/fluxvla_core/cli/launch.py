@@ -18,10 +18,10 @@ from typing import Any
 from fluxvla_core.cli import ranks
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, RunFailed, UsageError
-from fluxvla_core.signals import requests_to_stop
+from fluxvla_core.signals import requests_to_stop, signal_name
 
 _STOP_S = 30
-"""What torch's agent gives the others when a rank has failed: they have nothing left to save."""
+"""Seconds that torch's agent gives the other ranks to end when one has failed."""
 _HERE = "127.0.0.1"
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -96,11 +96,11 @@ def launch(
 
 
 def _store() -> Any:
-    """The store by which agent and ranks find each other, listening to this machine alone.
+    """The store by which agent and ranks find each other, on the loopback interface alone.
 
-    Anyone who reaches such a store can change what is in it, and so where ranks connect to. torch
-    has it listen on all interfaces unless it is given the socket; the rendezvous of kind "static",
-    which has nothing pickled in it, takes the one that this process has at its port already.
+    Anyone who reaches such a store can change where ranks connect to. Without a socket of ours
+    torch listens on all interfaces. The rendezvous "static", which pickles nothing, uses the store
+    that this process already has at its port.
     """
     from torch.distributed import TCPStore  # type: ignore[attr-defined]
 
@@ -148,7 +148,7 @@ def _signalled(
 
 
 def _stopped(number: signal.Signals, said: list[ranks.Failure], unsaved: RunFailed | None) -> int:
-    """How this command ends after a signal, by what the ranks said of it."""
+    """How this command ends after a signal, by the records of the ranks."""
     failed = [f for f in said if not f.asked and f.code != EXIT_INTERRUPTED]
     if failed:
         return _report_failure(ranks.root_cause(failed))
@@ -162,7 +162,7 @@ def _stopped(number: signal.Signals, said: list[ranks.Failure], unsaved: RunFail
 
 
 def _unsaved(silent: int, nproc: int, work_dir: Path, grace: int) -> RunFailed | None:
-    """What is left when ``silent`` ranks did not say how they ended: they had to be killed."""
+    """The error where ``silent`` ranks left no record, as they had to be killed."""
     from fluxvla_core.checkpoints.checkpoint import folders
 
     if not silent:
@@ -178,7 +178,7 @@ def _unsaved(silent: int, nproc: int, work_dir: Path, grace: int) -> RunFailed |
 
 
 def _all(ended: Mapping[int, Any], reported: Mapping[int, ranks.Failure]) -> list[ranks.Failure]:
-    """What each rank that failed said, or how it ended."""
+    """The failure of each rank: its own record, or how its process ended."""
     now = time.monotonic()
     first = min((f.time for f in reported.values()), default=now)
     failures = []
@@ -189,7 +189,9 @@ def _all(ended: Mapping[int, Any], reported: Mapping[int, ranks.Failure]) -> lis
         # SIGTERM came from us, and so did SIGKILL to one that did not answer it in time.
         late = process.exitcode == -signal.SIGKILL and now - first >= _STOP_S
         terminated = late or process.exitcode == -signal.SIGTERM
-        text = f"ended without an error message: {_ending(process.exitcode)}"
+        code = process.exitcode
+        ending = f"killed by {signal_name(-code)}" if code < 0 else f"exit code {code}"
+        text = f"ended without an error message: {ending}"
         if process.exitcode == -signal.SIGKILL:
             text += (
                 "\n  likely cause: this machine, or its container, ran out of memory (see "
@@ -206,7 +208,7 @@ def _all(ended: Mapping[int, Any], reported: Mapping[int, ranks.Failure]) -> lis
 
 
 def _report_failure(failure: ranks.Failure) -> int:
-    """Print what the rank would have printed; its exit code."""
+    """Print the rank's message; returns its exit code."""
     join = " " if failure.silent else " failed:\n"
     text = failure.text if failure.expected else f"rank {failure.rank}{join}{failure.text}"
     say(text, sys.stderr)
@@ -214,24 +216,17 @@ def _report_failure(failure: ranks.Failure) -> int:
 
 
 def _after(prefix: str, said: list[ranks.Failure]) -> str:
-    """What an interrupted rank added (where it saved), without the prefix itself."""
+    """The rest of an interrupted rank's message (where it saved), without the prefix."""
     texts = [
         f.text.removeprefix(prefix).removeprefix(": ") for f in said if f.code == EXIT_INTERRUPTED
     ]
     return texts[0] if texts else ""
 
 
-def _ending(code: int) -> str:
-    if code < 0:
-        return f"killed by {signal.Signals(-code).name}"
-    return f"exit code {code}"
-
-
 def die_with_parent() -> None:
-    """Make this rank end when its launcher, or torchrun's agent, does, however that ends.
+    """Make this rank end when its launcher, or torchrun's agent, does, even by ``kill -9``.
 
-    After ``kill -9`` of it, ranks that trained on would keep the work dir from the next
-    ``--resume auto``.
+    Ranks that trained on would keep the work dir locked for the next ``--resume auto``.
     """
     if not sys.platform.startswith("linux"):
         return

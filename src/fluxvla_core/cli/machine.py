@@ -1,7 +1,7 @@
-"""Facts about the machine that training and robots depend on, for ``fluxvla plugins doctor``.
+"""Facts about the machine, for ``fluxvla plugins doctor``: CUDA, ROS 2, rendering, disks.
 
-What has to be imported to be known (torch, rclpy, MuJoCo) is imported in processes that may break:
-a missing libEGL can end one.
+Libraries (torch, rclpy, MuJoCo) are imported in processes of their own: a missing libEGL can end
+one.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _ROS = {
 }
 """Key -> the environment variable that says it."""
 # What ROS 2 does where a variable is not set; https://docs.ros.org/en/kilted, environment
-# variables and "Improved dynamic discovery". Fast DDS has shared memory unless told otherwise.
+# variables and "Improved dynamic discovery". Fast DDS uses shared memory by default.
 _SHARING = ("DEFAULT", "LARGE_DATA", "SHM")  # of FASTDDS_BUILTIN_TRANSPORTS
 _ROS_DEFAULTS = {"domain_id": "0", "discovery_range": "SUBNET"}
 
@@ -73,8 +73,8 @@ def facts(limit_s: float | None, environ: Mapping[str, str] = os.environ) -> dic
     """JSON values; docs/files.md documents the keys.
 
     Args:
-        limit_s: seconds that one import may take; None imports nothing, and what only an import
-            tells is None then.
+        limit_s: seconds that one import may take; None imports nothing, and facts that need an
+            import are None then.
     """
     return {
         "python": platform.python_version(),
@@ -91,7 +91,7 @@ def facts(limit_s: float | None, environ: Mapping[str, str] = os.environ) -> dic
 
 
 def remarks(facts: Mapping[str, Any]) -> Iterator[tuple[bool, str]]:
-    """What is wrong (True) or may become so (False) with a machine that has these facts."""
+    """Problems (True) of a machine with these facts, and possible ones (False)."""
     if facts["torch"]["error"]:
         yield True, f"torch {facts['torch']['version']} is installed and {facts['torch']['error']}"
     ros2 = facts["ros2"]

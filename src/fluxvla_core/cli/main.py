@@ -1,7 +1,7 @@
 """``fluxvla``: find the command, run it, turn errors into messages and exit codes.
 
 A command is a class with ``help``, ``add_arguments(parser)`` and ``run(args) -> exit code``
-(``contracts.Command``); a plugin's own (group ``fluxvla.commands``) is the same.
+(``contracts.runner.Command``); a plugin's own (group ``fluxvla.commands``) is the same.
 
 Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted.
 """
@@ -37,68 +37,45 @@ USAGE = "usage: fluxvla COMMAND ...   (fluxvla COMMAND --help says what it takes
 
 
 class Entry(NamedTuple):
-    """``target`` is ``module:Class``."""
+    """A command: its class as ``module:Class``, and its line in ``fluxvla --help``."""
 
     target: str
     help: str
 
 
 COMMANDS: Mapping[str, Entry] = {
-    "run": Entry("fluxvla_core.cli.run:Run", "run a section of a config: train, evaluate, deploy"),
-    "config show": Entry(
-        "fluxvla_core.cli.config_commands:Show", "print the config as it resolves"
-    ),
-    "config check": Entry(
-        "fluxvla_core.cli.config_commands:Check", "check a config without importing anything"
-    ),
-    "config diff": Entry(
-        "fluxvla_core.cli.config_commands:Diff", "compare two configs, or runs, key by key"
-    ),
-    "config schema": Entry(
-        "fluxvla_core.cli.config_commands:Schema", "print a JSON Schema for editors"
-    ),
-    "plugins list": Entry("fluxvla_core.cli.plugin_commands:List", "list what is installed"),
-    "plugins show": Entry(
-        "fluxvla_core.cli.plugin_commands:Show", "show one class: its keys, its origin"
-    ),
-    "plugins doctor": Entry(
-        "fluxvla_core.cli.doctor:Doctor", "look for what is wrong with the installation"
-    ),
-    "plugins check": Entry(
-        "fluxvla_core.cli.check_plugin:CheckPlugin", "run the conformance kit of one class"
-    ),
-    "new-plugin": Entry(
-        "fluxvla_core.cli.new_plugin:NewPlugin", "begin a plugin that builds, is tested and runs"
-    ),
-    "data inspect": Entry("fluxvla_core.cli.data_commands:Inspect", "print what a dataset holds"),
-    "data validate": Entry(
-        "fluxvla_core.cli.data_commands:Validate", "read every row, decode every frame"
-    ),
-    "data stats": Entry(
-        "fluxvla_core.cli.data_commands:Stats", "print exact statistics of a dataset"
-    ),
-    "data convert": Entry(
-        "fluxvla_core.cli.data_commands:Convert", "write recordings, or LeRobot v2, as v3.0"
-    ),
-    "data finish": Entry(
-        "fluxvla_core.cli.data_commands:Finish", "finish a recording that was cut short"
-    ),
-    "data collect": Entry(
-        "fluxvla_core.cli.data_commands:Collect", "record demonstrations of a scripted expert"
-    ),
-    "eval compare": Entry(
-        "fluxvla_core.cli.policy_commands:Compare", "compare two evaluations, pair by pair"
-    ),
-    "export": Entry("fluxvla_core.cli.policy_commands:Export", "export a checkpoint for inference"),
-    "import-checkpoint": Entry(
-        "fluxvla_core.cli.policy_commands:ImportCheckpoint", "import another project's checkpoint"
-    ),
-    "bench-policy": Entry(
-        "fluxvla_core.cli.bench_command:BenchPolicy", "measure how long a policy takes to answer"
-    ),
-    "version": Entry("fluxvla_core.cli.main:Version", "print the versions"),
+    name: Entry(f"fluxvla_core.cli.{place}", help)
+    for name, place, help in (
+        ("run", "run:Run", "run a section of a config: train, evaluate, deploy"),
+        ("config show", "config_commands:Show", "print the config as it resolves"),
+        ("config check", "config_commands:Check", "check a config without importing anything"),
+        ("config diff", "config_commands:Diff", "compare two configs, or runs, key by key"),
+        ("config schema", "config_commands:Schema", "print a JSON Schema for editors"),
+        ("plugins list", "plugin_commands:List", "list what is installed"),
+        ("plugins show", "plugin_commands:Show", "show one class: its keys, its origin"),
+        ("plugins doctor", "doctor:Doctor", "look for what is wrong with the installation"),
+        ("plugins check", "check_plugin:CheckPlugin", "run the conformance kit of one class"),
+        ("new-plugin", "new_plugin:NewPlugin", "begin a plugin that builds, is tested and runs"),
+        ("data inspect", "data_commands:Inspect", "print what a dataset holds"),
+        ("data validate", "data_commands:Validate", "read every row, decode every frame"),
+        ("data stats", "data_commands:Stats", "print exact statistics of a dataset"),
+        ("data convert", "data_commands:Convert", "write recordings, or LeRobot v2, as v3.0"),
+        ("data finish", "data_commands:Finish", "finish a recording that was cut short"),
+        ("data collect", "data_commands:Collect", "record demonstrations of a scripted expert"),
+        ("eval compare", "policy_commands:Compare", "compare two evaluations, pair by pair"),
+        ("export", "policy_commands:Export", "export a checkpoint for inference"),
+        (
+            "import-checkpoint",
+            "policy_commands:Import",
+            "import another project's checkpoint",
+        ),
+        ("bench-policy", "bench_command:BenchPolicy", "measure how long a policy takes to answer"),
+        ("version", "main:Version", "print the versions"),
+    )
 }
-"""Name -> where the command is and its help line, so that only one is imported."""
+"""Every command by its name. Only the one that is called is imported."""
+
+_WIDTH = max(map(len, COMMANDS))
 
 RESERVED = frozenset({*COMMANDS, *(name.partition(" ")[0] for name in COMMANDS), "help"})
 """First words that always mean the core's; a plugin's is run as ``fluxvla distribution:name``."""
@@ -133,7 +110,7 @@ def _run(argv: list[str]) -> int:
 
 
 def report(error: BaseException) -> int:
-    """Say what went wrong on stderr, and give the exit code that belongs to it."""
+    """Print an error to stderr; returns its exit code."""
     from fluxvla_core.cli import ranks
 
     if isinstance(error, KeyboardInterrupt):
@@ -151,14 +128,14 @@ def report(error: BaseException) -> int:
 
 
 def _end_reason(error: BaseException | None) -> EndReason | None:
-    """Why a run ended, if that is known; of an error that closing met, why it was closed."""
+    """Why a run ended, if that is known; for an error while closing, what it was closed for."""
     while isinstance(error, Exception) and not isinstance(error, FluxError):
         error = error.__cause__ or error.__context__
     return error.reason if isinstance(error, RunFailed) else None
 
 
 def _complain(text: str, code: int) -> int:
-    with suppress(OSError):  # stderr is full, or gone: there is nowhere to say it
+    with suppress(OSError):  # stderr is full, or gone
         say(text, sys.stderr)
     return code
 
@@ -245,31 +222,19 @@ def overview() -> str:
     from fluxvla_core.plugins._metadata import index
 
     lines = [USAGE, "", *_rows(list(COMMANDS))]
-    theirs = {
-        name: providers
-        for (group, name), providers in sorted(index().plugins.items())
-        if group == "fluxvla.commands"
-    }
-    width = _width(list(COMMANDS))
-    for name, providers in theirs.items():
-        for plugin in providers:
+    for (group, name), providers in sorted(index().plugins.items()):
+        for plugin in providers if group == "fluxvla.commands" else ():
             word = name if len(providers) == 1 and name not in RESERVED else f"{plugin.dist}:{name}"
             about = read_help(plugin).partition(". ")[0].rstrip(".")
-            lines.append(f"  {word:{width}}  {about + ' ' if about else ''}(from {plugin.origin})")
+            lines.append(f"  {word:{_WIDTH}}  {about + ' ' if about else ''}(from {plugin.origin})")
     return "\n".join(lines)
 
 
 def _rows(names: list[str]) -> list[str]:
-    width = _width(list(COMMANDS))
-    return [f"  {name:{width}}  {COMMANDS[name].help}" for name in names]
-
-
-def _width(names: list[str]) -> int:
-    return max(len(name) for name in names)
+    return [f"  {name:{_WIDTH}}  {COMMANDS[name].help}" for name in names]
 
 
 class Version:
-    api = "1.0"
     help = "Print the versions of the core and of Python."
 
     def add_arguments(self, parser: Parser) -> None:

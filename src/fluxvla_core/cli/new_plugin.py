@@ -27,13 +27,22 @@ BASE = """(
     Joint.base("base_forward", "m/s", speed=0.5, acceleration=1.0),
     Joint.base("base_turn", "rad/s", speed=1.0, acceleration=2.0),
 )"""
-"""The joints of a mobile base, in the words of an embodiment."""
+"""The joints of a mobile base, as source text."""
 DOMAIN = "export ROS_DOMAIN_ID=42 ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
 """So that no other robot is commanded."""
 
 
+TEMPLATES = Path(__file__).resolve().parents[1] / "templates"
+PREFIX = "fluxvla-"
+SUFFIX = ".tmpl"
+COMMON = "common"
+# PEP 508's rule for names.
+_NAME = re.compile(r"[A-Za-z0-9]|[A-Za-z0-9][A-Za-z0-9._-]*[A-Za-z0-9]")
+_LONGEST = 32
+"""Characters of a name: paths and class names stay readable."""
+
+
 class NewPlugin:
-    api = "1.0"
     help = (
         "Write the sources of a new plugin into a new folder: a distribution that builds, passes "
         "its tests and runs as it is, with a stand-in for what only you have. Nothing is "
@@ -67,20 +76,15 @@ class NewPlugin:
 
 
 def _options(args: argparse.Namespace) -> dict[str, str]:
-    """Placeholders with what the command line says of a robot.
+    """Values of the placeholders that describe a robot.
 
     Raises:
-        UsageError: it says that of something else.
+        UsageError: they are given for another kind.
     """
-    given = {
-        "joints": args.joints is not None,
-        "cameras": args.cameras is not None,
-        "mobile-base": args.mobile_base,
-        "ros2": args.ros2,
-    }
-    for name, there in given.items():
-        if there and args.kind != ROBOT:
-            raise UsageError(f"--{name} is for --kind {ROBOT}, and this is a {args.kind}")
+    for name in ("joints", "cameras", "mobile_base", "ros2"):
+        if getattr(args, name) not in (None, False) and args.kind != ROBOT:
+            flag = name.replace("_", "-")
+            raise UsageError(f"--{flag} is for --kind {ROBOT}, and this is a {args.kind}")
     joints = JOINTS if args.joints is None else args.joints
     cameras = CAMERAS if args.cameras is None else args.cameras
     base = BASE if args.mobile_base else "()"
@@ -121,16 +125,6 @@ def _next_steps(folder: Path, plugin: Plugin, kind: Kind, files: int, todo: list
     ]
 
 
-TEMPLATES = Path(__file__).resolve().parents[1] / "templates"
-PREFIX = "fluxvla-"
-SUFFIX = ".tmpl"
-COMMON = "common"
-# PEP 508's rule for names.
-_NAME = re.compile(r"[A-Za-z0-9]|[A-Za-z0-9][A-Za-z0-9._-]*[A-Za-z0-9]")
-_LONGEST = 32
-"""Characters of a name: paths and class names stay readable."""
-
-
 @dataclass(frozen=True)
 class Part:
     """A class of a rendered plugin: its registry, what its name ends with, and its module."""
@@ -142,16 +136,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Kind:
-    """What is rendered for one kind of plugin.
+    """The templates and settings of one kind of plugin.
 
     Args:
-        parts: the classes that it registers; the first is the one that it is about.
+        parts: the classes that it registers; the first is the main one.
         folders: of templates, after ``common``; a later one replaces files of an earlier one.
-        about: what the distribution is, in its metadata and its package's docstring.
-        extras: of the core, that it cannot work without.
+        about: description, for its metadata and its package's docstring.
+        extras: extras of the core that it needs.
         run: the command that runs it, in the folder of the distribution.
         beside: the command that has to run meanwhile, in another terminal.
-        ci: what its CI installs besides.
+        ci: further packages that its CI installs.
     """
 
     parts: tuple[Part, ...]
@@ -165,6 +159,13 @@ class Kind:
 
 RUN = "fluxvla run --config configs/${short}.toml"
 RUN_STAND_IN = f"{RUN} --plugin configs/stand_in.py"
+
+
+def _in_training(name: str, about: str, part: Part) -> Kind:
+    """The kind of a class that is run by training a small stand-in model."""
+    return Kind((part,), ("training", name), f"{about} for FluxVLA", ("train",), RUN_STAND_IN)
+
+
 KINDS: Mapping[str, Kind] = {
     "operator": Kind(
         (
@@ -184,51 +185,20 @@ KINDS: Mapping[str, Kind] = {
         (),
         RUN_STAND_IN,
     ),
-    "model": Kind(
-        (Part("vlas", "VLA", "model"),),
-        ("training", "model"),
-        "A model for FluxVLA",
-        ("train",),
-        RUN_STAND_IN,
-    ),
+    "model": _in_training("model", "A model", Part("vlas", "VLA", "model")),
     "environment": Kind(
-        (
-            Part("environments", "Environment", "environment"),
-            Part("policies", "Expert", "expert"),
-        ),
+        (Part("environments", "Environment", "environment"), Part("policies", "Expert", "expert")),
         ("environment",),
         "An environment for FluxVLA",
         (),
         RUN,
     ),
-    "dataset": Kind(
-        (Part("datasets", "Dataset", "dataset"),),
-        ("training", "dataset"),
-        "A dataset for FluxVLA",
-        ("train",),
-        RUN_STAND_IN,
+    "dataset": _in_training("dataset", "A dataset", Part("datasets", "Dataset", "dataset")),
+    "transform": _in_training(
+        "transform", "A transform", Part("transforms", "Transform", "transform")
     ),
-    "transform": Kind(
-        (Part("transforms", "Transform", "transform"),),
-        ("training", "transform"),
-        "A transform for FluxVLA",
-        ("train",),
-        RUN_STAND_IN,
-    ),
-    "hook": Kind(
-        (Part("hooks", "Hook", "hook"),),
-        ("training", "hook"),
-        "A hook for FluxVLA",
-        ("train",),
-        RUN_STAND_IN,
-    ),
-    "metric": Kind(
-        (Part("metrics", "Metric", "metric"),),
-        ("training", "metric"),
-        "A metric for FluxVLA",
-        ("train",),
-        RUN_STAND_IN,
-    ),
+    "hook": _in_training("hook", "A hook", Part("hooks", "Hook", "hook")),
+    "metric": _in_training("metric", "A metric", Part("metrics", "Metric", "metric")),
     "command": Kind(
         (Part("commands", "Command", "command"),),
         ("command",),
@@ -236,12 +206,8 @@ KINDS: Mapping[str, Kind] = {
         (),
         "fluxvla ${type}",
     ),
-    "train-runner": Kind(
-        (Part("runners", "TrainRunner", "runner"),),
-        ("training", "train-runner"),
-        "A training strategy for FluxVLA",
-        ("train",),
-        RUN_STAND_IN,
+    "train-runner": _in_training(
+        "train-runner", "A training strategy", Part("runners", "TrainRunner", "runner")
     ),
 }
 ROS2 = replace(

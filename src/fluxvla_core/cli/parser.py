@@ -1,4 +1,7 @@
-"""``argparse`` that says more: no abbreviations, no repeats, a did-you-mean for what is unknown."""
+"""Argument parser of the commands, and the options that several of them share.
+
+``argparse`` with a did-you-mean for unknown options, without abbreviations and repeats.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ class Parser(argparse.ArgumentParser):
         return args
 
     def once(self, *flags: str, **options: Any) -> None:
-        """An option that may be given one time: of two values one would silently be lost."""
+        """An option that may be given once: of two values one would silently be lost."""
         self.add_argument(*flags, action=_Once, **options)
 
 
@@ -72,6 +75,23 @@ def natural(text: str) -> int:
     if number < 0:
         raise argparse.ArgumentTypeError(f"{text} is less than 0")
     return number
+
+
+def add_config_file(parser: argparse.ArgumentParser) -> None:
+    """The positional argument ``FILE``: a config."""
+    parser.add_argument("file", help="a .py, .toml or config.resolved.json")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """``--json``."""
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def add_log_format(parser: Parser) -> None:
+    """``--log-format``."""
+    parser.once(
+        "--log-format", choices=("text", "json"), default="text", help="format of progress messages"
+    )
 
 
 def add_overrides(parser: argparse.ArgumentParser) -> None:

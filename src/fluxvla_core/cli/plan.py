@@ -1,4 +1,4 @@
-"""The plan of ``fluxvla run``: decided and checked before anything heavy is imported."""
+"""The plan of ``fluxvla run``: config, section and work dir, checked before anything is built."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from fluxvla_core.config.check import Checked, Use, check_config, examine, type_key
 from fluxvla_core.config.load import CONFIG_FILE, load_config
 from fluxvla_core.config.overrides import apply_overrides
+from fluxvla_core.config.signature import Signature
 from fluxvla_core.config.tree import Config, join_key
 from fluxvla_core.errors import UsageError, nearest
 
@@ -27,6 +28,11 @@ class Plan:
     work_dir: Path
     uses: tuple[Use, ...]
 
+    @property
+    def signature(self) -> Signature | None:
+        """The constructor of the section's runner; None if it cannot be read."""
+        return next(use.found.signature for use in self.uses if use.key == self.section)
+
 
 def make_plan(
     file: str | None,
@@ -38,15 +44,17 @@ def make_plan(
     """Load, override and check a config, and choose the section.
 
     Args:
-        settings: what options of the command line set in the section that is chosen.
+        settings: keys of the chosen section that options of the command line set.
 
     Raises:
         UsageError: no config is named, or the section is not one that can run.
-        ConfigError: whatever is wrong with the config.
+        ConfigError: the config has problems.
     """
     overrides = tuple(overrides)
     if file is None:
-        raise UsageError("no config given: fluxvla run --config FILE", next=_configs_here())
+        here = sorted(str(p) for p in Path("configs").glob("*") if p.suffix in {".py", ".toml"})
+        listed = f"configs here: {', '.join(here[:8])}" if here else "fluxvla run --help"
+        raise UsageError("no config given: fluxvla run --config FILE", next=listed)
     config = apply_overrides(load_config(file), overrides)
     examined = examine(config, section)
     config = _of_checkpoint(config, Path(file), examined, {f"--set {o}" for o in overrides})
@@ -87,13 +95,6 @@ def _with_settings(
     places = {join_key(section, key): place or f"--{key}" for key in settings}
     origins = {**config.origins, **places}
     return replace(config, tree=tree, origins=origins)
-
-
-def _configs_here() -> str:
-    found = sorted(p for p in Path("configs").glob("*") if p.suffix in {".py", ".toml"})
-    if not found:
-        return "fluxvla run --help"
-    return "configs here: " + ", ".join(str(p) for p in found[:8])
 
 
 def choose_section(config: Config, checked: Checked, wanted: str | None) -> str:
@@ -152,9 +153,9 @@ def default_work_dir(file: Path, sections: Collection[str] = ()) -> Path:
 
 
 def refuse_overwriting(work_dir: Path, resume: str | None) -> None:
-    """A training must not land among the checkpoints of another.
+    """Refuse a training in a work dir that has checkpoints of another.
 
-    Here and not only where it begins: a restart would continue from whatever lies there.
+    Checked here, too, and not only where training begins: a restart would continue from them.
 
     Args:
         resume: the checkpoint to resume from: ``auto``, a path, or None for nothing.

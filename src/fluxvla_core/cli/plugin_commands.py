@@ -1,4 +1,4 @@
-"""``fluxvla plugins list`` and ``show``: the one reads metadata, the other a class's source."""
+"""``fluxvla plugins list``, from metadata, and ``plugins show``, from a class's source."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
-from fluxvla_core.cli.parser import Parser
+from fluxvla_core.cli.parser import Parser, add_json
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import MissingPlugin, PluginError, nearest
 from fluxvla_core.plugins import first_party
@@ -19,11 +19,10 @@ if TYPE_CHECKING:
 
 
 class List:
-    api = "1.0"
     help = "List everything that is installed for FluxVLA, without importing it."
 
     def add_arguments(self, parser: Parser) -> None:
-        parser.add_argument("--json", action="store_true", help="print JSON")
+        add_json(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         found = index()
@@ -52,12 +51,11 @@ def _table(plugins: list[Plugin]) -> list[str]:
 
 
 class Show:
-    api = "1.0"
-    help = "Show one class: what a config may say to it, and where it comes from."
+    help = "Show one class: the keys that a config may set, and where it comes from."
 
     def add_arguments(self, parser: Parser) -> None:
         parser.add_argument("name", help="a class's name, or distribution:name")
-        parser.add_argument("--json", action="store_true", help="print JSON")
+        add_json(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         found = providers(args.name)
@@ -165,7 +163,7 @@ def _signature(plugin: Plugin) -> tuple[Signature | None, str]:
 
 
 def _process(plugin: Plugin) -> str:
-    """What sends an operator's commands (docs/control.md, Control process)."""
+    """The process that sends an operator's commands (docs/control.md, Control process)."""
     from fluxvla_core.config.signature import implements
 
     divided = implements(plugin, "fluxvla_core.contracts.robot", "without_cameras")

@@ -6,14 +6,13 @@ import argparse
 from collections.abc import Sequence
 
 from fluxvla_core.atomic import json_text
-from fluxvla_core.cli.parser import Parser
+from fluxvla_core.cli.parser import Parser, add_json
 from fluxvla_core.cli.reporters import heartbeat
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.errors import UsageError
 
 
 class Compare:
-    api = "1.0"
     help = (
         "Compare two evaluations of the same episodes, pair by pair: an exact McNemar test. Exit "
         "code 2 if they are not of the same tasks and seeds."
@@ -28,7 +27,7 @@ class Compare:
         parser.add_argument(
             "--common", action="store_true", help="leave out episodes that only one side has"
         )
-        parser.add_argument("--json", action="store_true", help="print JSON")
+        add_json(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.evaluation.compare import compare, describe, read
@@ -40,7 +39,6 @@ class Compare:
 
 
 class Export:
-    api = "1.0"
     help = (
         "Export a checkpoint for inference into a new folder: all weights in one safetensors "
         "file, adapters merged, with config, statistics, robot and processors."
@@ -60,24 +58,21 @@ class Export:
         )
 
     def run(self, args: argparse.Namespace) -> int:
-        if args.format is not None:
-            from fluxvla_core.training.export import export_foreign
-
-            with heartbeat(f"exporting {args.checkpoint}"):
-                path = export_foreign(args.checkpoint, args.folder, args.format)
-            say(f"{path}: as {args.format} saves one")
-            return 0
-        from fluxvla_core.training.export import export
+        from fluxvla_core.training.export import export, export_foreign
 
         with heartbeat(f"exporting {args.checkpoint}"):
-            path = export(args.checkpoint, args.folder)
-        size = (path / "model.safetensors").stat().st_size
-        say(f"{path}: model.safetensors of {size / 1e6:.1f} MB and what it needs to act")
+            if args.format is None:
+                path = export(args.checkpoint, args.folder)
+                size = (path / "model.safetensors").stat().st_size
+                about = f"model.safetensors of {size / 1e6:.1f} MB and what it needs to act"
+            else:
+                path = export_foreign(args.checkpoint, args.folder, args.format)
+                about = f"as {args.format} saves one"
+        say(f"{path}: {about}")
         return 0
 
 
-class ImportCheckpoint:
-    api = "1.0"
+class Import:
     help = (
         "Make a checkpoint of FluxVLA from one of another project (openpi, LeRobot, GR00T, …), by "
         "the format that an installed plugin has for its model family."
@@ -121,7 +116,9 @@ class ImportCheckpoint:
     def run(self, args: argparse.Namespace) -> int:
         from fluxvla_core.training.export import embodiment_in, import_checkpoint
 
-        rate_hz, cameras = _rate(args.rate), _cameras(args.camera)
+        if args.rate is not None and not 0 < args.rate < float("inf"):
+            raise UsageError(f"--rate {args.rate:g} is not a rate")
+        cameras = _cameras(args.camera)
         embodiment = None if args.embodiment is None else embodiment_in(args.embodiment)
         with heartbeat(f"importing {args.source}"):
             path, checkpoint = import_checkpoint(
@@ -130,16 +127,13 @@ class ImportCheckpoint:
                 format=args.format,
                 tokenizer=args.tokenizer,
                 embodiment=embodiment,
-                action_rate_hz=rate_hz,
+                action_rate_hz=args.rate,
                 cameras=cameras,
                 robot=args.robot,
             )
         name = "no robot" if checkpoint.embodiment is None else checkpoint.embodiment.name
-        rate = (
-            "an unknown rate"
-            if not checkpoint.action_rate_hz
-            else f"{checkpoint.action_rate_hz:g} Hz"
-        )
+        hz = checkpoint.action_rate_hz
+        rate = f"{hz:g} Hz" if hz else "an unknown rate"
         say(
             f"{path}: {checkpoint.model['type']}, {len(checkpoint.tensors)} tensors; cameras "
             f"{', '.join(checkpoint.img_keys) or 'none'}; chunks of {checkpoint.horizon} actions "
@@ -148,12 +142,6 @@ class ImportCheckpoint:
         for note in checkpoint.notes:
             say(f"note: {note}")
         return 0
-
-
-def _rate(hz: float | None) -> float | None:
-    if hz is not None and not 0 < hz < float("inf"):
-        raise UsageError(f"--rate {hz:g} is not a rate")
-    return hz
 
 
 def _cameras(options: Sequence[str]) -> dict[str, str | None]:

@@ -1,4 +1,4 @@
-"""Ranks: what a process knows of being one of several, and how it reports to its launcher.
+"""Ranks: a process's place among those of a training, and its records for the launcher.
 
 Each rank of ``fluxvla run --nproc N`` writes its error to a file instead of the terminal: when
 one fails the others fail because of it, and only the first error helps.
@@ -21,7 +21,7 @@ from fluxvla_core.errors import EndReason, RunFailed
 ERROR_DIR = "FLUXVLA_ERROR_DIR"
 LAUNCHER = "FLUXVLA_LAUNCHER_PID"
 JOB = "run.job"
-"""In a work dir: which job of several processes began to train there last."""
+"""File of a work dir: the job of several processes that began to train there last."""
 _TAKEN = "taken"  # in the agent's folder: its job's work dir was taken away, with the message
 _NO_ID = "none"  # torchrun's --rdzv-id, of any job that was given none
 GRACE_S = 600
@@ -45,10 +45,10 @@ def attempt() -> int:
 
 
 def resume_from(asked: str | None, work_dir: Path) -> str | None:
-    """The checkpoint to resume from: ``--resume``, and after a restart what there is by then.
+    """The checkpoint to resume from: ``--resume``, or after a restart the newest one.
 
-    That only where this job had begun: an attempt that was refused is refused again, and does not
-    continue with what others left.
+    The newest one only if this job wrote it: an attempt that was refused is refused again, and does
+    not continue from the checkpoints of others.
     """
     if attempt() == 0 or not _started_here(work_dir):
         return asked
@@ -58,7 +58,7 @@ def resume_from(asked: str | None, work_dir: Path) -> str | None:
 
 
 def mark_started(work_dir: Path) -> None:
-    """Mark that this job trains in ``work_dir``; to be called when nothing refused it."""
+    """Mark ``work_dir`` as this job's, once its setup has succeeded."""
     from fluxvla_core.atomic import write_text
 
     if rank() != 0:
@@ -70,10 +70,10 @@ def mark_started(work_dir: Path) -> None:
 
 
 def refuse_lost_work_dir() -> None:
-    """A job whose work dir was taken away does not begin in what is there now when it is restarted.
+    """Refuse to restart a job that lost its work dir: another one may be there now.
 
     Raises:
-        RunFailed: what it ended with.
+        RunFailed: the error that it ended with.
     """
     place = _agent_folder()
     if attempt() and place is not None and (place / _TAKEN).exists():
@@ -100,7 +100,7 @@ def _started_here(work_dir: Path) -> bool:
 
 
 def _job() -> dict[str, str]:
-    """What stays over a job's restarts, and distinguishes it from others."""
+    """The identity of a job, which is the same after a restart."""
     import socket
 
     # The parent is the agent too, but in containers all have the same number, and a script may be
@@ -131,11 +131,10 @@ def restart_notice() -> list[str]:
 
 
 def exit_now(code: int) -> NoReturn:
-    """End this rank's process at once, with everything it said written out.
+    """Flush the output and end this rank's process at once.
 
     gloo's threads can outlive the interpreter and then abort it ("terminate called without an
-    active exception") after all work is done and saved; a launcher takes that for a failure.
-    Leaving this way gives them no chance to.
+    active exception") after all work is done and saved, which a launcher takes for a failure.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -193,7 +192,7 @@ def record_failure(
 
 
 def record_finished(late: int) -> None:
-    """Report to the launcher that this rank did all it had to.
+    """Report to the launcher that this rank is done.
 
     Args:
         late: the signal that asked it to stop when there was nothing left to stop, or 0.
@@ -209,7 +208,7 @@ def failures(folder: Path, which: int | None = None) -> dict[int, Failure]:
 
 
 def finished(folder: Path) -> dict[int, int]:
-    """The ranks that did all they had to in the last attempt, with the signal that came late."""
+    """The ranks that were done in the last attempt, each with the signal that came late, or 0."""
     return dict(_read_records(folder, "done"))
 
 
@@ -240,7 +239,7 @@ def _read_records(folder: Path, kind: str, which: int | None = None) -> list[Any
 
 
 def root_cause(found: Sequence[Failure]) -> Failure:
-    """The failure that the others followed from, as well as one can see.
+    """The failure that most likely caused the others.
 
     A rank that was asked to stop never is. A FluxError names a cause; a rank that was killed
     explains the broken connections of the others; else the earliest is.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from fluxvla_core.cli.terminal import say
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 
 EVERY_S = 4.0
 """Seconds between two lines of one progress where lines stay (a log file, JSON)."""
@@ -116,6 +116,19 @@ def heartbeat(what: str, every: float = EVERY_S) -> Iterator[None]:
         yield
     finally:
         reporter.close()
+
+
+def make_reporter(log_format: str, stream: TextIO | None = None) -> RunReporter:
+    """The reporter for ``--log-format``: ``json``, or ``text`` (bars where ``stream`` has a
+    terminal behind it)."""
+    out = sys.stdout if stream is None else stream
+    if log_format == "json":
+        return JsonReporter(out)
+    if out.isatty():
+        from fluxvla_core.cli.rich_reporter import RichReporter
+
+        return RichReporter(out)
+    return LineReporter(out)
 
 
 class Throttle:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shlex
 import signal
 import sys
@@ -25,15 +26,16 @@ from fluxvla_core.cli.plan import Plan, make_plan, refuse_overwriting
 from fluxvla_core.cli.terminal import say
 from fluxvla_core.config.check import check_config
 from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, UsageError
-from fluxvla_core.plugins.files import load_plugin_files
+from fluxvla_core.plugins.registry import load_plugin_files
 
 EVALUATION = "eval"
-_OF_A_RANK = ("MASTER_", "TORCHELASTIC_", "GROUP_", "ROLE_")
-_OF_ONE_RANK = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "TORCH_NCCL_ASYNC_HANDLING")
+_OF_A_RANK = re.compile(
+    r"(MASTER|TORCHELASTIC|GROUP|ROLE)_.*|(LOCAL_)?(RANK|WORLD_SIZE)|TORCH_NCCL_ASYNC_HANDLING"
+)
+"""Environment variables that torch's launcher sets for its ranks."""
 
 
 class Run:
-    api = "1.0"
     help = (
         "Run one section of a config: train with its runner, evaluate, or drive a robot. The "
         "config is checked as a whole first; a .py config is executed."
@@ -103,7 +105,7 @@ class Run:
         after = _plan_evaluation(args, plan) if args.eval_after_train else None
         if args.dry_run:
             from fluxvla_core.cli.dry_run import outline
-            from fluxvla_core.config.hints import whole_options
+            from fluxvla_core.config.overrides import whole_options
 
             text, refused = outline(plan, args.log_format, args.nproc)
             say(text)
@@ -135,8 +137,8 @@ class Run:
                 configured = plan.config.tree[plan.section].get("resume_from")
                 refuse_overwriting(plan.work_dir, asked or configured)
         if plan.trains and _launches(args):
-            from fluxvla_core.cli.choose_reporter import make_reporter
             from fluxvla_core.cli.launch import launch
+            from fluxvla_core.cli.reporters import make_reporter
 
             grace = args.grace or ranks.GRACE_S
             reporter = make_reporter(args.log_format)
@@ -157,14 +159,13 @@ class Run:
 
 @contextmanager
 def _resume_hint(plan: Plan) -> Iterator[None]:
-    """Ctrl-C says what is kept, and how to continue."""
+    """After Ctrl-C, print what is kept and how to continue."""
     try:
         yield
     except KeyboardInterrupt as error:
-        if isinstance(error.__cause__, FluxError):  # which says itself how
+        if isinstance(error.__cause__, FluxError):  # it says how itself
             raise
-        (signature,) = (use.found.signature for use in plan.uses if use.key == plan.section)
-        said = str(error)
+        signature, said = plan.signature, str(error)
         if plan.trains:
             way = "run the same command again with --resume auto"
         elif signature is not None and "episodes" in signature.names:
@@ -176,21 +177,18 @@ def _resume_hint(plan: Plan) -> Iterator[None]:
 
 
 def _check_options(args: argparse.Namespace, plan: Plan) -> None:
-    """Options that this kind of section has no use for are slips."""
+    """Refuse options that this kind of section has no use for."""
+    section = f"section {plan.section!r}"
     if plan.trains and (args.task is not None or args.tasks is not None):
-        raise UsageError(f"--task says what a robot is to do, and section {plan.section!r} trains")
+        raise UsageError(f"--task says what a robot is to do, and {section} trains")
     if plan.trains and args.free_task:
-        raise UsageError(f"--free-task is for a robot, and section {plan.section!r} trains")
+        raise UsageError(f"--free-task is for a robot, and {section} trains")
     if args.task is not None and args.tasks is not None:
         raise UsageError("--task and --tasks both say what to do: give one of them")
-    if not plan.trains and args.resume is not None:
-        raise UsageError(f"--resume is for training, and section {plan.section!r} does not train")
-    for flag in ("max_restarts", "eval_after_train"):
-        if getattr(args, flag) and not plan.trains:
-            raise UsageError(
-                f"--{flag.replace('_', '-')} is for training, and section {plan.section!r} does "
-                "not train"
-            )
+    for name in ("resume", "max_restarts", "eval_after_train"):
+        if not plan.trains and getattr(args, name) not in (None, 0, False):
+            flag = name.replace("_", "-")
+            raise UsageError(f"--{flag} is for training, and {section} does not train")
     if args.grace is not None and not (plan.trains and _launches(args)):
         raise UsageError(
             "--grace is for the processes that --nproc or --max-restarts starts",
@@ -198,8 +196,7 @@ def _check_options(args: argparse.Namespace, plan: Plan) -> None:
         )
     if (args.nproc or 1) > 1 and not _divides(plan):
         raise UsageError(
-            "--nproc is for processes that train or evaluate together, and section "
-            f"{plan.section!r} runs in one",
+            f"--nproc is for processes that train or evaluate together, and {section} runs in one",
             next="leave it out",
         )
     if args.resume not in (None, "auto") and not Path(args.resume).exists():
@@ -211,10 +208,8 @@ def _check_options(args: argparse.Namespace, plan: Plan) -> None:
 
 def _divides(plan: Plan) -> bool:
     """Whether the section's runner trains or has ``workers``, or its signature is unreadable."""
-    (signature,) = (use.found.signature for use in plan.uses if use.key == plan.section)
-    if plan.trains or signature is None or signature.open:
-        return True
-    return "workers" in signature.names
+    signature = plan.signature
+    return plan.trains or signature is None or signature.open or "workers" in signature.names
 
 
 def _launches(args: argparse.Namespace) -> bool:
@@ -229,9 +224,13 @@ def _command_line(args: argparse.Namespace) -> list[str]:
         value = getattr(args, name)
         if value is not None:
             argv += [f"--{name.replace('_', '-')}", value]
-    for name, values in (("--set", args.overrides), ("--plugin", args.plugin_files)):
-        argv += [word for value in values for word in (name, value)]
-    return [*argv, "--log-format", args.log_format]
+    return [*argv, *_repeated(args)]
+
+
+def _repeated(args: argparse.Namespace) -> list[str]:
+    """The options of the config and of progress again, for another process."""
+    options = [("--set", o) for o in args.overrides] + [("--plugin", f) for f in args.plugin_files]
+    return [word for option in [*options, ("--log-format", args.log_format)] for word in option]
 
 
 # -- --eval-after-train -----------------------------------------------------------------------
@@ -253,10 +252,7 @@ def _plan_evaluation(args: argparse.Namespace, plan: Plan) -> list[str]:
             next=f"sections that do not train: {', '.join(others) or 'none'}",
         )
     argv = ["run", "--config", args.config, "--section", EVALUATION]
-    argv += ["--work-dir", str(plan.work_dir), "--log-format", args.log_format]
-    for name, values in (("--set", args.overrides), ("--plugin", args.plugin_files)):
-        argv += [word for value in values for word in (name, value)]
-    return argv
+    return [*argv, "--work-dir", str(plan.work_dir), *_repeated(args)]
 
 
 def _evaluate(argv: list[str], late: int = 0) -> None:
@@ -272,11 +268,7 @@ def _evaluate(argv: list[str], late: int = 0) -> None:
             sys.stderr,
         )
         return
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(_OF_A_RANK) and name not in _OF_ONE_RANK
-    }
+    environment = {n: value for n, value in os.environ.items() if not _OF_A_RANK.fullmatch(n)}
     sys.stdout.flush()
     sys.stderr.flush()
     os.execve(sys.executable, [sys.executable, "-m", "fluxvla_core", *argv], environment)

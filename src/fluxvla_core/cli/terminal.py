@@ -28,10 +28,27 @@ def say(text: str, stream: TextIO | None = None) -> None:
 
 
 def prepare() -> None:
-    """Let stdout and stderr take any text: what a terminal has no letter for becomes an escape."""
+    """Let stdout and stderr take any text: what a terminal has no letter for becomes an escape.
+
+    A standard stream that is closed (``fluxvla ... <&-``) becomes the null device: the next file
+    that is opened would get its number otherwise, and be another process's stdin.
+    """
+    for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        if getattr(sys, name) is None and not _is_open(descriptor):
+            null = open(os.devnull, mode)  # noqa: SIM115 - as long as the process
+            os.set_inheritable(null.fileno(), True)
+            setattr(sys, name, null)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def _is_open(descriptor: int) -> bool:
+    try:
+        os.fstat(descriptor)
+    except OSError:
+        return False
+    return True
 
 
 def give_up(error: OSError) -> int:

@@ -1,6 +1,6 @@
-"""Check a whole config against the classes that it names, before anything is imported or built.
+"""Check a whole config against the classes that it names, without importing anything.
 
-Keys and classes only. Types of values are left to the constructors: annotations in the wild are
+Only keys and classes are checked. Types of values are left to the constructors: annotations are
 too often wrong to refuse a config by them.
 """
 
@@ -27,7 +27,7 @@ from fluxvla_core.plugins.first_party import FIRST_PARTY
 from fluxvla_core.plugins.load import LIST
 
 REQUIRES = "requires"
-"""The key of ``requires = ["fluxvla-ur>=0.3"]``: what a config says it needs (PEP 508)."""
+"""The key of the distributions that a config needs (PEP 508): ``["fluxvla-ur>=0.3"]``."""
 # ``inference_model`` is in configs of upstream FluxVLA. Nothing is built from it here: a policy is
 # built from the checkpoint's ``model``. Its classes are checked like any others.
 _NAMED = (*SECTIONS, "model", "inference_model", *LOADERS, REQUIRES, "hooks")
@@ -37,7 +37,7 @@ _NEEDS_TYPE = frozenset(SLOTS) - {"dataset", "datasets", "hooks", "action_filter
 
 @dataclass(frozen=True)
 class Use:
-    """One class that the config names: where, from which registry, and who provides it."""
+    """One class that the config names: its key, registry and provider."""
 
     key: str
     found: Found
@@ -50,9 +50,9 @@ class Checked:
     Args:
         sections: names of the runnable sections (tables whose ``type`` is a runner).
         trains: those of them that train.
-        uses: every class named in what was checked.
+        uses: every class that is named.
         problems: empty if the config is good.
-        missing: whether a plugin that is not there is among them.
+        missing: whether one of them is a plugin that is not installed.
     """
 
     sections: tuple[str, ...]
@@ -75,7 +75,7 @@ def check_config(config: Config, section: str | None = None) -> Checked:
 
 
 def examine(config: Config, section: str | None = None) -> Checked:
-    """Everything that is wrong with ``config``, without importing a plugin.
+    """The problems of ``config`` and the classes that it uses, without importing a plugin.
 
     Args:
         section: check for running this one. Plugins that only other sections need may then be
@@ -107,10 +107,10 @@ def type_key(section: str) -> str:
 
 
 def _needed(config: Config, section: str, trains: bool, sections: tuple[str, ...]) -> set[str]:
-    """Top-level names whose plugins must be there to run ``section``.
+    """Top-level names whose plugins must be installed to run ``section``.
 
-    Inference and evaluation take their model from a checkpoint or a server; training, or what may
-    be training because its runner is missing, needs the config's own.
+    Inference and evaluation take their model from a checkpoint or a server; training, or a section
+    that may train because its runner is missing, needs the config's own.
     """
     if not trains:
         return {section, "hooks"}
@@ -177,9 +177,11 @@ class _Walk:
                 self.value(join_key(key, name), value, name, whole)
 
     def value(self, key: str, value: Any, slot: str, whole: bool) -> None:
-        """``slot`` is the name that ``value``, or the list that it is in, stands under.
+        """Check ``value``.
 
-        ``whole`` is False in variables, which a config may complete elsewhere.
+        Args:
+            slot: the name of the key of ``value``, or of the list that it is in.
+            whole: False in variables, which a config may complete elsewhere.
         """
         registry = SLOTS.get(slot)
         if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Read a config: ``.py``, ``.toml``, or the ``config.resolved.json`` of an earlier run."""
+"""Config files: read (``.py``, ``.toml``, ``config.resolved.json``), and written for a run."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from typing import Any
 from fluxvla_core.config.positions import py_positions
 from fluxvla_core.config.tree import Config, all_keys, join_bases, merge, plain, shown, strip
 from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.plugins._metadata import CORE, index, version
 from fluxvla_core.plugins.load import locate
 from fluxvla_core.untrusted import AT_MOST, read_bytes
 
 BASE = "_base_"
 CONFIG_FILE = "config.resolved.json"
-"""What a run leaves in its work dir, to be run again."""
+"""The resolved config in a run's work dir, which can be run again."""
 FORMAT = "fluxvla-config-1"
 SUFFIXES = (".py", ".toml", ".json")
 DEEPEST = 100
@@ -26,6 +27,9 @@ MOST_KEYS = 5_000
 """Most keys of all tables together; this project's own configs have fewer than 500."""
 _LONGEST_CHAIN = 50  # files
 _LONGEST_FILE = 1 << 20  # bytes
+ENVIRONMENT_FILE = "environment.json"
+_LOOKED_AT = 2000  # folders: a hint is not worth a walk over a whole disk
+_PACKAGES = ("torch", "numpy", "pyarrow", "av", "mujoco", "transformers", "rclpy")
 
 
 def load_config(path: str | Path) -> Config:
@@ -43,9 +47,9 @@ def load_config(path: str | Path) -> Config:
 
 
 def _load(path: Path, chain: tuple[Path, ...], loaded: dict[Path, Config]) -> Config:
-    """``path``, which the files of ``chain`` inherit; ``loaded`` holds those that were read by now.
+    """Load ``path``, which the files of ``chain`` inherit; ``loaded`` has the files read before.
 
-    Each file is read once: of 25 files that each name the next one twice, the last would else be
+    Each file is read once: if 25 files each name the next one twice, the last would otherwise be
     read 16 million times.
     """
     _check_there(path)
@@ -151,8 +155,8 @@ def _base_path(base: str, child: Path, where: str) -> Path:
 
 
 def _check_size(values: Any, name: str) -> None:
-    """Refuse what is larger than people write: checking it, and listing what is wrong, would take
-    minutes, and recursion over it could end in the middle."""
+    """Refuse a config that is larger than people write: to check it would take minutes, and
+    recursion over it could fail."""
     level, count = [values], 0
     for _ in range(DEEPEST + 1):
         count += sum(len(table) for table in level if isinstance(table, dict))
@@ -215,7 +219,7 @@ def _from_python(text: str, name: str, path: Path) -> Config:
 
 
 def _is_data(name: str, value: Any) -> bool:
-    """Helpers that a config defines for itself (imports, functions, paths) are not keys."""
+    """Whether it is a key: imports, functions and paths of a ``.py`` config are not."""
     if name.startswith("_") or isinstance(value, types.ModuleType):
         return False
     return value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))
@@ -235,6 +239,14 @@ def _quote(text: str | None) -> str:
     return f" in {text.strip()!r}" if text and text.strip() else ""
 
 
+def _unreadable(error: Exception, name: str) -> ConfigError:
+    """The error for text that the parsers of TOML and JSON give up on."""
+    if isinstance(error, RecursionError):
+        return _too_deep(name)
+    # A whole number of thousands of digits.
+    return ConfigError(f"a value cannot be read: {error}", where=name)
+
+
 def _from_toml(text: str, name: str) -> Config:
     import tomli
 
@@ -248,10 +260,8 @@ def _from_toml(text: str, name: str) -> Config:
             f"syntax error: {error.msg} (column {error.colno}){_quote(line[0] if line else None)}",
             where=f"{name}:{error.lineno}",
         ) from error
-    except ValueError as error:  # a whole number of thousands of digits
-        raise ConfigError(f"a value cannot be read: {error}", where=name) from error
-    except RecursionError as error:
-        raise _too_deep(name) from error
+    except (ValueError, RecursionError) as error:
+        raise _unreadable(error, name) from error
     _check_size(values, name)
     return _finish(values, toml_positions(text, name), name)
 
@@ -261,10 +271,8 @@ def _from_json(text: str, name: str) -> Config:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ConfigError(f"syntax error: {error.msg}", where=f"{name}:{error.lineno}") from error
-    except ValueError as error:  # a whole number of thousands of digits
-        raise ConfigError(f"a value cannot be read: {error}", where=name) from error
-    except RecursionError as error:
-        raise _too_deep(name) from error
+    except (ValueError, RecursionError) as error:
+        raise _unreadable(error, name) from error
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else None
         raise ConfigError(
@@ -286,3 +294,67 @@ def _from_json(text: str, name: str) -> Config:
         raise ConfigError.from_problems(problems)
     there = set(all_keys(tree))
     return _finish(tree, {k: v for k, v in origins.items() if k in there}, name)
+
+
+# -- files of a work dir ---------------------------------------------------------------------------
+
+
+def write_resolved(path: Path, config: Config) -> None:
+    """Write ``config`` so that ``load_config(path)`` gives it back, key for key.
+
+    Raises:
+        OSError: as opening, writing and renaming do; an older file stays as it was.
+    """
+    from fluxvla_core import atomic
+
+    atomic.write_json(
+        path,
+        {"format": FORMAT, "config": config.tree, "origins": dict(sorted(config.origins.items()))},
+    )
+
+
+def environment() -> dict[str, Any]:
+    """Versions of Python, the core, every installed plugin and the main libraries.
+
+    Read from metadata; nothing is imported.
+    """
+    import platform
+
+    plugins = [
+        plugin.to_dict() for _, providers in sorted(index().plugins.items()) for plugin in providers
+    ]
+    return {
+        "format": "fluxvla-environment-1",
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        CORE: version(CORE),
+        "packages": {name: have for name in _PACKAGES if (have := version(name))},
+        "plugins": plugins,
+    }
+
+
+def work_dirs_below(folder: Path, depth: int = 3) -> list[Path]:
+    """Work dirs of earlier runs in ``folder``, for a hint: the newest first, not all of many."""
+    found: list[tuple[float, Path]] = []
+    level, looked = [folder], 0
+    for _ in range(depth):
+        below: list[Path] = []
+        for place in level:
+            for inner in _folders_in(place):
+                looked += 1
+                config = inner / CONFIG_FILE
+                if looked > _LOOKED_AT:
+                    break
+                if config.is_file():  # folders inside are its sections' and checkpoints'
+                    found.append((config.stat().st_mtime, inner))
+                else:
+                    below.append(inner)
+        level = below
+    return [path for _, path in sorted(found, reverse=True)]
+
+
+def _folders_in(place: Path) -> list[Path]:
+    try:
+        return [p for p in place.iterdir() if not p.name.startswith(".") and p.is_dir()]
+    except OSError:  # not ours to read, or gone by now
+        return []

@@ -1,11 +1,12 @@
-"""``--set key=value``: the command line's changes to a config, with TOML values."""
+"""``--set key=value``: the command line's changes to a config, and hints that suggest one."""
 
 from __future__ import annotations
 
 import copy
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from fluxvla_core.config.tree import (
     plain,
     split_key,
 )
-from fluxvla_core.errors import ConfigError, Problem, nearest
+from fluxvla_core.errors import ConfigError, FluxError, Problem, nearest
 
 _PYTHON = {"True": True, "False": False, "None": None}
 _SPLIT = re.compile(r"\s*(\+?)=\s*")
@@ -97,11 +98,11 @@ def parse_value(text: str) -> Any:
         ) from error
     found: list[tuple[str, str]] = []
     data = plain(value, "", found)
-    return text if found else data  # TOML's dates and times: keep what was typed
+    return text if found else data  # TOML's dates and times stay text
 
 
 def _number(text: str) -> float | int | None:
-    """``text`` as a number if Python reads it as one, else None: a string was hardly meant."""
+    """``text`` as a number if Python reads it as one, else None."""
     try:
         number = float(text)
     except ValueError:
@@ -110,7 +111,7 @@ def _number(text: str) -> float | int | None:
 
 
 def _put(tree: dict[str, Any], key: str, value: Any, add: bool, text: str) -> list[str]:
-    """Set ``key`` in ``tree`` as ``text`` says; returns the keys that now hold what was given."""
+    """Set ``key`` in ``tree``; returns the keys of the new values. ``text`` is for messages."""
     *above, last = split_key(key)
     at: Any = tree
     done = ""
@@ -133,7 +134,7 @@ def _put(tree: dict[str, Any], key: str, value: Any, add: bool, text: str) -> li
 
 
 def _added(old: Any, value: Any, key: str) -> tuple[Any, list[str]]:
-    """``value`` added to what ``key`` holds, and the keys of what is new."""
+    """``value`` added to the value of ``key``, and the keys of the new values."""
     if isinstance(old, list):
         more = value if isinstance(value, list) else [value]
         return [*old, *more], [join_key(key, len(old) + i) for i in range(len(more))]
@@ -187,7 +188,68 @@ def _meant(text: str, key: str) -> str:
 
 
 def _as_set(text: str, key: str, sign: str) -> str:
-    """The override ``text`` for another key, as it is to be typed."""
+    """The override ``text`` for another key, quoted for a shell."""
     match = _SPLIT.search(text)
     assert match is not None  # it was parsed
     return f"--set {shlex.quote(f'{key}{sign}{text[match.end() :]}')}"
+
+
+# -- hints ---------------------------------------------------------------------------------------
+
+# A class does not know where in a config its table stands. Its hint says
+# ``--set <ClassName>.KEY=VALUE``, or ``--set <section>.KEY=VALUE`` for the section that runs, and
+# the code that has the config puts the table's own key there.
+_TABLE = re.compile(r"(--set '?)<(\w+)>\.")
+_SECTION = "section"
+
+
+@contextmanager
+def whole_options(config: Mapping[str, Any], section: str = "") -> Iterator[None]:
+    """Complete the hint of an error that is raised inside.
+
+    Args:
+        section: the section that runs; its tables go before those of others.
+    """
+    try:
+        yield
+    except FluxError as error:
+        if error.next:
+            error.next = complete(error.next, config, section)
+        raise
+
+
+def complete(hint: str, config: Mapping[str, Any], section: str = "") -> str:
+    """``hint`` with the keys of tables for ``<ClassName>``.
+
+    The keys of several tables of the class are listed after it; with none (the table is in a
+    checkpoint) the hint stays.
+    """
+    notes: dict[str, str] = {}
+
+    def key(match: re.Match[str]) -> str:
+        name = match[2]
+        if name == _SECTION:
+            return f"{match[1]}{section}." if section else match[0]
+        here = list(_tables(config.get(section), name, section)) if section else []
+        found = here or list(_tables(config, name, ""))
+        if len(found) == 1:
+            return f"{match[1]}{found[0]}."
+        if found:
+            notes[name] = f" (<{name}> is {' or '.join(found)})"
+        return match[0]
+
+    return _TABLE.sub(key, hint) + "".join(notes.values())
+
+
+def _tables(tree: Any, name: str, key: str) -> Iterator[str]:
+    """Keys of the tables with ``type`` ``name`` or ``distribution:name``."""
+    if isinstance(tree, Mapping):
+        if str(tree.get("type")).rpartition(":")[2] == name:
+            yield key
+        items = list(tree.items())
+    elif isinstance(tree, list | tuple):
+        items = list(enumerate(tree))
+    else:
+        return
+    for inner, value in items:
+        yield from _tables(value, name, join_key(key, inner))

@@ -1,4 +1,4 @@
-"""Parameters as source states them: constructors', and the fields of dataclasses."""
+"""Parameters of constructors and fields of dataclasses, from source."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def dataclass_fields(
     """Fields of a dataclass and of the dataclasses that it inherits from, bases first.
 
     Args:
-        counts: which classes have fields; dataclasses by default.
+        counts: whether a class has fields; dataclasses by default.
     """
     found: dict[str, Parameter] = {}
     for base in reversed(order):
@@ -82,13 +82,9 @@ def dataclass_fields(
             kind = (dotted_name(node.annotation) or "").rpartition(".")[2]
             if kind in {"ClassVar", "KW_ONLY"} or _left_out(node.value):
                 continue
-            found[node.target.id] = Parameter(
-                node.target.id,
-                not _has_default(node.value),
-                base.module.place(node.lineno),
-                (node.annotation, _default(node.value)),
-                base.module.name,
-            )
+            name, default = node.target.id, _default(node.value)
+            place, stated = base.module.place(node.lineno), (node.annotation, default)
+            found[name] = Parameter(name, default is None, place, stated, base.module.name)
     return tuple(found.values())
 
 
@@ -118,10 +114,6 @@ def _field_options(value: ast.expr | None) -> dict[str, ast.expr] | None:
 def _left_out(value: ast.expr | None) -> bool:
     option = (_field_options(value) or {}).get("init")
     return isinstance(option, ast.Constant) and option.value is False
-
-
-def _has_default(value: ast.expr | None) -> bool:
-    return _default(value) is not None
 
 
 def _default(value: ast.expr | None) -> ast.expr | None:

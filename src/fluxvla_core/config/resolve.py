@@ -60,7 +60,7 @@ LOADER_KEYS = (
     "shuffle_episodes",
     "dataset",
 )
-"""What the core's own train runners read of ``train_dataloader``."""
+"""Keys of ``train_dataloader`` that the core's train runners read."""
 
 SEARCHED = tuple(name for name in BY_NAME if name != "commands")
 

@@ -140,7 +140,7 @@ def _class_place(cls: type) -> str:
 
 @dataclass(frozen=True)
 class Misfit:
-    """A key whose value is of none of the types that its parameter is annotated with."""
+    """A key whose value has none of the annotated types of its parameter."""
 
     name: str
     expected: str
@@ -151,7 +151,7 @@ class Misfit:
 
 
 def misfits(cls: type, values: Mapping[str, Any]) -> list[Misfit]:
-    """The values that cannot be what the constructor of ``cls``, or of a base, asks for."""
+    """The values that do not fit the annotations of the constructor of ``cls`` or of a base."""
     found = []
     hints = _hints(cls)
     for name, value in values.items():
@@ -180,7 +180,7 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether it may; anything that is not plain counts as fitting."""
+    """Whether ``value`` may be a ``hint``; unknown annotations fit everything."""
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, one) for one in typing.get_args(hint))

@@ -1,12 +1,11 @@
-"""JSON Schema (draft 2020-12) of the configs that what is installed can run.
+"""JSON Schema (draft 2020-12) of configs, for the installed plugins.
 
 For editors: names of sections and keys, ``type`` from the registries, and each class's parameters
-with types, defaults and descriptions. Signatures and docstrings are read as ``config check`` reads
-them, without importing a plugin; the latter finds more, such as what a ``_base_`` leaves undone.
+with types, defaults and descriptions, read without importing a plugin. ``config check`` finds more,
+such as a required key that neither a file nor its ``_base_`` sets.
 
-A file that inherits (``_base_``) writes parts of tables, and so does a variable that is composed
-into others: there, nothing is required. Every definition therefore exists twice, ``whole:…`` and
-``part:…``.
+A file with ``_base_`` has parts of tables, and so has a variable that is composed into others:
+there, nothing is required. Every definition therefore exists twice, ``whole:…`` and ``part:…``.
 """
 
 from __future__ import annotations
@@ -28,11 +27,12 @@ from fluxvla_core.config.signature import Signature, table_of
 from fluxvla_core.config.source import dotted_name
 from fluxvla_core.config.tree import DELETE
 from fluxvla_core.errors import PluginError
-from fluxvla_core.plugins._metadata import CORE, Plugin, version
+from fluxvla_core.plugins._metadata import CORE, version
 from fluxvla_core.plugins.load import is_core
 from fluxvla_core.plugins.registry import BY_NAME
 from fluxvla_core.registries import BY_NAME as ROWS
 
+Schema = dict[str, Any]
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _WHOLE, _PART = "whole", "part"
 # A table under these may hold others by name instead of being of a class itself.
@@ -61,7 +61,9 @@ def config_schema() -> Schema:
             for one in found:
                 definitions[f"{kind}:{registry}:{one.names[0]}"] = _table(kind, one.found)
     definitions["section"] = _section(classes["runners"])
-    definitions["untyped"] = _untyped()
+    # A table of an unknown class: its values are known by the names of their keys.
+    tables = {name: {"$ref": _ref(_PART, registry)} for name, registry in SLOTS.items()}
+    definitions["untyped"] = {"properties": tables}
     return {
         "$schema": DIALECT,
         "title": "FluxVLA config",
@@ -80,7 +82,7 @@ def _ref(*parts: str) -> str:
 
 
 def _classes(registry: str) -> Iterable[_Class]:
-    """Every class of a registry that a config can name; what cannot work is left out."""
+    """Every class of a registry that a config can name, without broken ones."""
     group = BY_NAME[registry]
     registered = [name for name in group if group.registered(name) is not None]
     for name in registered:
@@ -92,16 +94,11 @@ def _classes(registry: str) -> Iterable[_Class]:
         for plugin in plugins:
             qualified = f"{plugin.dist}:{name}"
             plain = plugin in preferred and name not in registered
-            found_class = _installed(plugin)
-            if found_class is not None:
-                yield _Class((name, qualified) if plain else (qualified,), found_class)
-
-
-def _installed(plugin: Plugin) -> Found | None:
-    try:
-        return installed(plugin)
-    except PluginError:  # doctor, and the check of a config that names it, say why
-        return None
+            try:
+                resolved = installed(plugin)
+            except PluginError:  # reported by ``plugins doctor`` and ``config check``
+                continue
+            yield _Class((name, qualified) if plain else (qualified,), resolved)
 
 
 def _file(kind: str) -> Schema:
@@ -140,12 +137,6 @@ def _section(runners: list[_Class]) -> Schema:
     }
 
 
-def _untyped() -> Schema:
-    """A table whose class is not known here: what its keys hold is known by their names."""
-    tables = {name: {"$ref": _ref(_PART, registry)} for name, registry in SLOTS.items()}
-    return {"properties": tables}
-
-
 def _loader(kind: str) -> Schema:
     """``train_dataloader``; another runner may read keys of its own there."""
     return {
@@ -168,7 +159,7 @@ def _loader(kind: str) -> Schema:
 def _slot(kind: str, registry: str, classes: list[_Class]) -> Schema:
     """A value under a key that takes classes of ``registry``: a table, or a list of such.
 
-    A policy may be a word and a metric an object's name: what is neither is left to the class.
+    Other values (a policy may be a word, a metric an object's name) are left to the class.
     """
     names = [one.names[0] for one in classes]
     named: Schema = {
@@ -199,7 +190,7 @@ def _slot(kind: str, registry: str, classes: list[_Class]) -> Schema:
         slot["if"] = {"type": "string"}
         slot["then"] = named
     if kind == _WHOLE and registry not in _MAY_GROUP:
-        # An empty table is what a config writes to be filled in.
+        # An empty table may be filled in by another file.
         slot["if"] = {"type": "object", "minProperties": 1}
         slot["then"] = {"required": ["type"]}
     return slot
@@ -247,8 +238,6 @@ def _parameter(kind: str, parameter: Parameter, meaning: str | None) -> Schema:
         schema["description"] = " ".join(said)
     return schema
 
-
-Schema = dict[str, Any]
 
 _SCALARS = {
     "bool": "boolean",

@@ -1,8 +1,7 @@
 """Constructor signatures, read from source: nothing is imported.
 
 ``**kwargs`` are followed into the constructors of base classes, ``**options`` into the fields of
-the dataclass that the class attribute ``Options`` names; what each parameter means is read from
-docstrings.
+the dataclass that the class attribute ``Options`` names. Descriptions come from docstrings.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _ANY_TABLE = frozenset({"None", "Mapping", "dict", "Dict"})
 
 @dataclass(frozen=True)
 class Forward:
-    """The call by which an ``__init__`` hands its ``**kwargs`` to the next one."""
+    """The call that passes ``**kwargs`` of an ``__init__`` to that of a base class."""
 
     positional: int = 0
     named: frozenset[str] = frozenset()
@@ -47,7 +46,7 @@ class Forward:
 
 @dataclass(frozen=True)
 class Init:
-    """One ``__init__`` on the way up.
+    """One ``__init__`` of a class or a base class.
 
     Args:
         parameters: its own.
@@ -69,7 +68,7 @@ class Signature:
     """The keys that a config may set for a class.
 
     ``open`` means that further keys cannot be ruled out (``**kwargs`` that go nowhere known);
-    ``documented`` reads what docstrings say of parameters, those of the class before its bases'.
+    ``documented`` reads descriptions of parameters, those of the class before those of its bases.
     """
 
     name: str
@@ -257,7 +256,7 @@ def with_kwargs(
     kwargs: str,
     place: Callable[[int], str],
 ) -> Init:
-    """An ``__init__`` that takes ``**kwargs``: what it sets and pops there, and hands on."""
+    """An ``__init__`` with ``**kwargs``: the keys that it sets, pops and passes on."""
     filled: set[str] = set()
     taken: list[Parameter] = []
     for inner in ast.walk(node):
@@ -342,7 +341,7 @@ def _meanings(order: list[Any]) -> dict[str, str]:
 
 
 def _argument_texts_of(node: ast.ClassDef | ast.FunctionDef) -> dict[str, str]:
-    """By a class itself: strings below its fields, its docstring, and its ``__init__``'s."""
+    """From strings below the fields of a class, its docstring, and its ``__init__``'s."""
     init = _init_of(node)
     found = argument_texts(ast.get_docstring(init)) if init else {}
     found |= argument_texts(ast.get_docstring(node))

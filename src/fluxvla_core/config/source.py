@@ -1,4 +1,4 @@
-"""Classes and their docstrings as their source files have them, without importing anything."""
+"""Parse source files: classes, their bases and docstrings, without importing anything."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _CLOSED = frozenset(sys.stdlib_module_names | {"torch", "numpy"})
 
 @dataclass(frozen=True, eq=False)
 class Module:
-    """One parsed source file; ``names`` maps what its top level defines to the defining node."""
+    """One parsed source file; ``names`` maps its top-level names to their nodes."""
 
     name: str
     path: Path
@@ -77,7 +77,7 @@ Base = Source | Opaque
 
 
 def flaw(dotted: str) -> str | None:
-    """``file:line`` and why it is not Python, of a module on the way to ``dotted``; else None."""
+    """``file:line`` and the syntax error of a module in ``dotted``; None if there is none."""
     parts = dotted.split(".")
     for end in range(len(parts), 0, -1):
         name = ".".join(parts[:end])
@@ -128,9 +128,10 @@ def parse(name: str) -> Module | None:
 
 
 def _tree(path: Path) -> ast.Module | None:
-    """The statements of a file; bodies of methods that nothing here reads are left out.
+    """The statements of a file without the bodies of methods.
 
-    They are most of a file, and parsing takes most of the time of ``fluxvla config check``.
+    Nothing here reads them, they are most of a file, and parsing takes most of the time of
+    ``fluxvla config check``.
     """
     source = path.read_bytes()
     with suppress(SyntaxError, ValueError):
@@ -199,7 +200,7 @@ def find(module: str, dotted: str, seen: frozenset[tuple[str, str]] = frozenset(
 
 
 def _inside(parsed: Module, node: ast.ClassDef, rest: str, whole: str) -> Base:
-    """The class ``rest`` in the body of ``node``, or of a class in there that is named."""
+    """The nested class ``rest`` (dotted) of ``node``."""
     if not rest:
         return Source(parsed, node)
     part, _, rest = rest.partition(".")
@@ -335,7 +336,7 @@ _ENTRY = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*)(?: \([^)]*\))?:\s*(.*)$")
 def argument_texts(docstring: str | None) -> dict[str, str]:
     """Parameter -> its description, on one line; empty where there is no such section.
 
-    ``height, width: of the images`` is said of both.
+    ``height, width: of the images`` describes both.
     """
     text = inspect.cleandoc(docstring or "")
     section = _SECTION.search(text)
@@ -349,7 +350,7 @@ def argument_texts(docstring: str | None) -> dict[str, str]:
         if not line.strip():
             continue
         indent = len(line) - len(line.lstrip())
-        if indent <= margin:  # the next section, or what is said after it
+        if indent <= margin:  # the next section, or text after it
             break
         inner = indent if inner is None else inner
         entry = _ENTRY.match(line.strip()) if indent == inner else None

@@ -1,4 +1,4 @@
-"""A config as data: one plain tree, its dotted keys, and the place that each came from.
+"""A config as data: one plain tree, its dotted keys, and the source position of each.
 
 Dotted keys are like ``runner.collator.keys.0``; a dot inside a part is written ``\\.``.
 """
@@ -28,9 +28,9 @@ class Config:
         tree: tables (dict), lists and scalars (str, int, float, bool, None); nothing else, so
             that a run and the ``config.resolved.json`` that it wrote build the same objects.
         origins: dotted key -> ``file:line`` (or the ``--set`` that put it there).
-        file: the file that was asked for, as messages show it.
-        left_over: keys whose table got another ``type`` from a file that inherits theirs, and
-            that this file did not repeat: they were written for another class.
+        file: the file that was loaded, as messages show it.
+        left_over: inherited keys of tables whose ``type`` an inheriting file changed: they were
+            written for another class.
     """
 
     tree: dict[str, Any]
@@ -51,7 +51,7 @@ class Config:
 
 
 def shown(path: Path) -> str:
-    """``path`` as people read it: relative where that is shorter than climbing out."""
+    """``path`` for messages: relative to the current directory if it is inside."""
     try:
         # realpath takes a link that leads to itself as it is; resolve() raises.
         return str(Path(os.path.realpath(path)).relative_to(os.path.realpath(Path.cwd())))
@@ -62,7 +62,7 @@ def shown(path: Path) -> str:
 def plain(value: Any, key: str, problems: list[tuple[str, str]]) -> Any:
     """A copy of ``value`` in plain data: tuples become lists, paths strings.
 
-    What is not data is left out and appended to ``problems`` as (key, finding).
+    Other objects are left out and appended to ``problems`` as (key, finding).
     """
     if isinstance(value, str):
         return _text(value, key, problems)
@@ -100,13 +100,13 @@ def _text(text: str, key: str, problems: list[tuple[str, str]]) -> str:
 
 
 def is_text(text: str) -> bool:
-    """Whether it can be written to a file: halves of surrogate pairs, of JSON's escapes or of a
-    command line that is not UTF-8, cannot."""
+    """Whether it can be encoded: halves of surrogate pairs, from JSON's escapes or a command line
+    that is not UTF-8, cannot."""
     return text.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def strip(value: Any) -> Any:
-    """``value`` without ``_delete_`` marks: where nothing was inherited they say nothing."""
+    """``value`` without ``_delete_`` marks, for tables that inherit nothing."""
     if isinstance(value, dict):
         return {k: strip(v) for k, v in value.items() if k != DELETE}
     if isinstance(value, list):
@@ -257,12 +257,12 @@ def _another_type(old: dict[str, Any], new: dict[str, Any]) -> bool:
 
 
 def _clash(old: Any, new: Any) -> bool:
-    """Whether one of them is a table and the other a value that is no 'off'."""
+    """Whether one of them is a table and the other a value other than None."""
     return isinstance(old, dict) != isinstance(new, dict) and old is not None and new is not None
 
 
 def _values(table: dict[str, Any], at: str = "") -> Iterator[str]:
-    """Keys of everything that merging treats as one value: all but tables."""
+    """Keys of everything but tables; merging replaces these values."""
     for name, value in table.items():
         key = join_key(at, name)
         if isinstance(value, dict) and value:
@@ -287,7 +287,7 @@ def _way_on(value: Any) -> str:
 
 
 def freeze(value: Any) -> Any:
-    """A read-only copy of a plain tree: what one object changed, the next would be built from.
+    """A read-only copy of a plain tree: a change by one object would reach the next one.
 
     Dicts and lists that refuse to change: still ``dict`` and ``list`` for ``isinstance``, ``json``
     and ``**``. Copies (``dict(x)``, ``x.copy()``, ``copy.deepcopy``, pickles) can be changed.

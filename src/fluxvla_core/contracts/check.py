@@ -28,24 +28,24 @@ from fluxvla_core.contracts.runner import TrainRunner
 from fluxvla_core.contracts.training import RandomTransform
 from fluxvla_core.errors import LoadFailed
 from fluxvla_core.registries import BY_NAME, check_api
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Arguments = int | tuple[str, ...] | None
-"""What a method is given, without ``self``: so many positional arguments, keywords of these names,
-or (None) what the class itself says that it wants."""
+"""Arguments of a call, without ``self``: a number of positional ones, keywords of these names, or
+(None) those that the class itself names."""
 
 Methods = Mapping[str, Arguments]
 
 ANY_OTHER = "any other"
 """No name that a parameter can have: only ``**more`` takes it."""
 ON_A_ROBOT = ("embodiment", "action_rate_hz", "horizon")
-"""What a policy says of itself, to drive a robot."""
+"""Attributes that a policy needs to drive a robot."""
 _MISSING = "is missing"
 
 
 @functools.cache
 def contract_of(registry: str) -> type[Contract]:
-    """The base class of ``registry``; where it has none, ``Contract``, which asks for nothing."""
+    """The base class of ``registry``; ``Contract``, which requires nothing, if it has none."""
     module, _, name = (BY_NAME[registry].contract or "").partition(":")
     if not module:
         return Contract
@@ -61,7 +61,7 @@ def needs(contract: type[Contract], cls: type) -> tuple[Methods, ...]:
 
 
 def methods(contract: type[Contract]) -> Methods:
-    """Every method of ``contract``, required and optional, with what it is given."""
+    """Every method of ``contract``, required and optional, with its arguments."""
     found = {name: _arguments(contract, f) for name, f in public_methods(contract).items()}
     return {**found, **contract._besides}
 
@@ -109,7 +109,7 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
 
 
 def _halves(contract: type[Contract], cls: type) -> list[str]:
-    """Groups of methods of which ``cls`` has some, and not all."""
+    """Problems with groups of methods that ``cls`` has only in part."""
     problems = []
     for group in contract._together:
         there = [f"{m}()" for m in group if _lookup(contract, cls, m) is not None]
@@ -192,7 +192,7 @@ def check_operator(operator: object) -> None:
 
 
 def check_policy(policy: Any) -> None:
-    """Check that a policy says of itself what driving a robot with it takes.
+    """Check that a policy has the attributes that driving a robot needs.
 
     Raises:
         LoadFailed: it has no ``embodiment``, ``action_rate_hz`` or ``horizon``, or one that cannot
@@ -231,12 +231,12 @@ def chunk_problems(action_rate_hz: object, horizon: object) -> list[str]:
 def _lookup(contract: type[Contract], cls: type, method: str) -> Any:
     """The attribute ``method`` of ``cls`` or a base, without binding it; None if there is none.
 
-    Not what its metaclass has: every class is callable, and its objects need not be. Nor what the
-    contract has: that is either a default, or abstract.
+    Attributes of its metaclass do not count: every class is callable, and its objects need not be.
+    Nor do those of the contract, which are defaults or abstract.
     """
     bases = [base for base in cls.__mro__ if base not in contract.__mro__]
     found = next((vars(base)[method] for base in bases if method in vars(base)), None)
-    # Stands in torch.nn.Module for the forward that a subclass is to bring.
+    # torch.nn.Module's placeholder for a missing forward.
     return None if getattr(found, "__name__", "") == "_forward_unimplemented" else found
 
 
@@ -262,7 +262,7 @@ def _method_problem(
         inspect.signature(function).bind(*bound, **dict.fromkeys(names))
     except TypeError as error:
         return f"{method}() must accept {_in_words(arguments)}: {error}"
-    except ValueError:  # written in C, where not every function says what it takes
+    except ValueError:  # written in C, without a signature
         return None
     return None
 

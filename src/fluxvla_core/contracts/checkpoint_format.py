@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class ForeignCheckpoint:
         img_keys: cameras, in the order in which the model takes their images.
         transforms: tables of the transforms from a robot's observation to a batch; one of them
             normalises states and actions, and is able to undo it.
-        statistics: ``{"private": {"proprio": {...}, "action": {...}}}``, what they normalise by.
+        statistics: ``{"private": {"proprio": {...}, "action": {...}}}``, which they normalise by.
         horizon: actions in a chunk.
-        action_rate_hz: actions a second, where the checkpoint says it.
-        embodiment: the robot that it was trained for, where the checkpoint describes it.
-        notes: what somebody who imports it ought to know.
+        action_rate_hz: actions a second, if the checkpoint has it.
+        embodiment: the robot that it was trained for, if the checkpoint describes it.
+        notes: remarks for the person who imports it.
     """
 
     model: Mapping[str, Any]
@@ -45,8 +45,8 @@ class CheckpointFormat(Contract):
     """Reads, and may write, one model family's checkpoints as another project saves them."""
 
     name: ClassVar[str] = ""
-    """``--format``: the project that the format is of (``lerobot``, ``openpi``); several classes
-    may have the same, one a model family."""
+    """``--format``: the project of the format (``lerobot``, ``openpi``); classes for several model
+    families may share it."""
     model_types: ClassVar[Sequence[str]] = ()
     """The ``type`` of the models that it reads and writes."""
 

@@ -1,8 +1,8 @@
-"""Base class of all contracts, and the one place where classes that inherit none are adapted.
+"""Base class of all contracts, and the adapter for classes that do not inherit one.
 
-A contract is a base class. Its abstract methods must be there; everything else has a default that
-works. A class may inherit it, or only have its methods: ``Contract.adapt`` makes up for the rest,
-so that code that calls an operator, a policy or a filter never asks whether a method is there.
+A contract is a base class. Its abstract methods are required; everything else has a working
+default. A class may inherit it, or only have its methods: ``Contract.adapt`` supplies the defaults,
+so that code that calls an operator, a policy or a filter never tests for a method.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ else:
             self._function = function
 
         def __get__(self, made, owner=None):
-            # Without ``__set__``, so that what a constructor sets comes first.
+            # Without ``__set__``, so that a value set by a constructor comes first.
             return self if made is None else self._function(made)
 
     class required(attribute):
@@ -62,9 +62,9 @@ class Contract(metaclass=ABCMeta):
 
     api: ClassVar[str]
     _besides: ClassVar[Mapping[str, int]] = {}
-    """Methods that some classes have instead, and how many arguments they are given."""
+    """Methods that some classes have instead -> number of their arguments."""
     _together: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    """Groups of optional methods of which a class brings all or none."""
+    """Groups of optional methods; a class defines all of a group or none."""
     _any_arguments: ClassVar[bool] = False
     """Whether a class chooses which of the arguments its methods take."""
 
@@ -75,10 +75,10 @@ class Contract(metaclass=ABCMeta):
 
     @classmethod
     def adapt(cls: type[C], made: Any) -> C:
-        """``made`` as an object of this contract: itself, or something that hands all on to it.
+        """``made`` as an object of this contract: itself, or an adapter that delegates to it.
 
-        What ``made`` lacks is the contract's default. An abstract method's default does nothing;
-        :func:`implements` distinguishes it from a method of the class.
+        The adapter has the contract's defaults for everything that ``made`` lacks. An abstract
+        method's default does nothing; :func:`implements` distinguishes it from the class's own.
         """
         if isinstance(made, cls):
             return made
@@ -99,7 +99,7 @@ def public_methods(contract: type[Contract]) -> dict[str, Any]:
 
 
 def abstract_methods(contract: type[Contract]) -> tuple[str, ...]:
-    """Names of the methods that a subclass must bring, in the order of their definition."""
+    """Names of the methods that a subclass must define, in the order of their definition."""
     return tuple(n for n in public_methods(contract) if n in contract.__abstractmethods__)
 
 
@@ -113,9 +113,9 @@ def original(made: Any) -> Any:
 
 
 def implements(candidate: Any, contract: type[Contract], ability: str) -> bool:
-    """Whether ``candidate`` brings the optional ``ability`` itself, and not the contract's default.
+    """Whether ``candidate`` itself defines the optional ``ability``.
 
-    A property is not asked, which may raise.
+    A property is not evaluated, as it may raise.
     """
     candidate = original(candidate)
     attribute = inspect.getattr_static(candidate, ability, _NOTHING)
@@ -127,7 +127,7 @@ def implements(candidate: Any, contract: type[Contract], ability: str) -> bool:
 
 
 class _Adapter:
-    """Everything of the object that was adapted; the contract's defaults for what that lacks."""
+    """Delegates to the adapted object; has the contract's defaults for everything it lacks."""
 
     def __init__(self, made: Any, contract: type[Contract]) -> None:
         names = {n for base in contract.__mro__ for n in vars(base) if base is not object}
@@ -137,7 +137,7 @@ class _Adapter:
         object.__setattr__(self, "_lacks", lacks)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickled, for data workers, as what was adapted: its class is of this process alone."""
+        """Pickle the adapted object, for data workers: the adapter's class is local to this one."""
         return object.__getattribute__(self, "_contract").adapt, (original(self),)
 
     def __getattribute__(self, name: str) -> Any:
@@ -145,7 +145,7 @@ class _Adapter:
             return object.__getattribute__(self, name)
         made = object.__getattribute__(self, "_made")
         lacks = name in object.__getattribute__(self, "_lacks")
-        # An object may set later what it lacked at first.
+        # An object may set a missing attribute later.
         if lacks and getattr(made, "__dict__", {}).get(name) is None:
             return object.__getattribute__(self, name)
         return getattr(made, name)

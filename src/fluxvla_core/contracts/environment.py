@@ -1,8 +1,8 @@
 """The contract of environments: simulators in which policies are evaluated and data is collected.
 
-An environment's constructor is light: what ``spec`` says is known before a scene is built, which
-the first ``reset`` does. Everything random in an episode follows from its seed; then its outcome
-depends neither on the process that ran it nor on the episodes before it.
+An environment's constructor is light: ``spec`` is known before the first ``reset`` builds a scene.
+Everything random in an episode follows from its seed, so that its outcome depends neither on the
+process that ran it nor on the episodes before it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.spec import Camera, EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """One thing to be done.
+    """One task of an environment.
 
     Args:
         name: unique in its environment; used in file names and as a key.
         instruction: the language instruction that a policy gets.
         max_steps: control steps after which an episode ends.
-        record_steps: how many of a demonstration's steps teach something; all by default.
+        record_steps: how many steps of a demonstration to record; all by default.
     """
 
     name: str
@@ -48,12 +48,12 @@ class EnvironmentSpec:
         embodiment: what actions and states mean, control steps a second (``rate_hz``), and the
             cameras with their usual sizes.
         tasks: at least one.
-        limited: actions are joint targets that take the way of a robot's commands: they are
-            joined at ``rate_hz`` and kept within the embodiment's limits. Otherwise each action of
-            a chunk is one step.
-        keep_together: going from one task to another takes seconds, so that episodes of one task
-            are best run one after the other.
-        details: what else a report should state: how images are drawn, versions.
+        limited: actions are joint targets that are processed as a robot's commands are: joined at
+            ``rate_hz`` and kept within the embodiment's limits. Otherwise each action of a chunk is
+            one step.
+        keep_together: changing the task takes seconds, so that episodes of one task are best run
+            one after the other.
+        details: further facts for reports: how images are rendered, versions.
     """
 
     name: str
@@ -137,8 +137,7 @@ class Environment(Contract):
         ``task_description`` is the language instruction: the task's, or one of the environment's
         own for this episode.
 
-        Called when the policy or a video needs it, not after every step: rendering is what takes
-        the time.
+        Called when the policy or a video needs it, not after every step: rendering is slow.
         """
 
     @abstractmethod
@@ -161,7 +160,7 @@ class Environment(Contract):
 
     @attribute
     def distributions(self) -> Sequence[str]:
-        """Installed packages that outcomes follow from, besides those that its plugin requires."""
+        """Installed packages that influence outcomes, besides those that its plugin requires."""
         return ()
 
     def state_hash(self) -> str | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from fluxvla_core.contracts.contract import Contract, attribute, implements, required
 from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.frame import Observation
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 class Continuation:
     """The prefix that a policy's next chunk has to continue (real-time chunking).
 
-    It is what is left of the chunk that is being executed, at the times of the next one's actions.
+    It is the rest of the chunk that is being executed, at the times of the next one's actions.
 
     Args:
         actions: ``(T, dim)`` float64 in physical units, ``T`` being the policy's horizon: where
             the arm is going to be at the times of the new chunk's actions if no new chunk comes.
-            Rows beyond the end of what is known repeat its last.
+            Rows beyond the end of the current chunk repeat its last.
         weights: ``(T,)`` float64, how much the new chunk has to agree with each row: 1 for rows
             that will have been executed before the answer arrives, 0 for those that are free.
         frozen: how many rows at the beginning will have been executed, by measured latency.
@@ -75,14 +75,14 @@ class Actor(Contract):
     @attribute
     def n_obs_steps(self) -> int:
         """Observations that it acts on, the present one last; the others are the ``history`` of
-        the observation that it is asked with."""
+        the observation that it gets."""
         return 1
 
     @attribute
     def executed(self) -> npt.NDArray[np.float64] | None:
         """``(N, dim)`` commands that lead to the last chunk's first action; None: a straight line.
 
-        What a demonstrator does may be noisier than what it means.
+        A demonstrator's executed commands may be noisier than the actions to learn.
         """
         return None
 
@@ -107,11 +107,11 @@ class Actor(Contract):
 def with_history(
     observation: Observation, n_obs_steps: int, before: Sequence[Observation] = ()
 ) -> Observation:
-    """``observation`` with the ``history`` that a policy of ``n_obs_steps`` is asked with.
+    """``observation`` with the ``history`` for a policy of ``n_obs_steps``.
 
     Args:
-        before: what was observed before in the episode, one action apart, the oldest first. Its
-            first is repeated where there are too few; the present one where there is none.
+        before: earlier observations of the episode, one action apart, the oldest first. The first
+            is repeated if there are too few; the present one if there are none.
     """
     if n_obs_steps == 1:
         return observation

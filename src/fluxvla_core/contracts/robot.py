@@ -1,4 +1,4 @@
-"""The contracts of what runs at a robot's rate: operator and its parts, action filter, clock."""
+"""The contracts of a robot: operator and its parts, action filter, clock."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from fluxvla_core.contracts.contract import Contract, attribute, required
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.errors import NotReady, Rejected
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np
@@ -86,7 +86,7 @@ class Operator(Contract):
 
     @attribute
     def follows_commands(self) -> bool:
-        """Whether the arm does what it is sent; False for a recorded one.
+        """Whether the arm executes its commands; False for a recorded one.
 
         Its tracking error is then no fault.
         """
@@ -257,10 +257,10 @@ class Part(Enum):
             )
 
     def divided(self, part: Part, connected: bool, robot: str) -> Part:
-        """``part``, for an operator that is this one as yet.
+        """``part``, if an operator that is ``self`` can become it.
 
         Args:
-            part: what it is to become.
+            part: the new part.
             connected: whether it is connected.
             robot: its name, for the message.
 

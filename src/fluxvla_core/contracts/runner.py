@@ -1,4 +1,4 @@
-"""The contracts of what the command line runs, and of what watches it: runner, hook, command."""
+"""The contracts of runners, hooks, commands and reporters."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fluxvla_core.contracts.frame import Observation
-    from fluxvla_core.spec.embodiment import EmbodimentSpec
+    from fluxvla_core.spec import EmbodimentSpec
 
 
 class Runner(Contract):
-    """Inference or evaluation: what a config section runs.
+    """Inference or evaluation, as a section of a config runs it.
 
     The command line calls the constructor, ``run_setup()`` and ``run()``.
     """
 
     @abstractmethod
     def run(self) -> Any:
-        """Do the work; what it returns is shown and written."""
+        """Do the work; the result is shown and written."""
 
     @abstractmethod
     def run_setup(self) -> None:
@@ -42,7 +42,7 @@ class TrainRunner(Contract):
 
     @abstractmethod
     def run(self, vla_dataset: Any) -> Any:
-        """Train on the dataset; what it returns is shown and written."""
+        """Train on the dataset; the result is shown and written."""
 
     @abstractmethod
     def run_setup(self, *, n_train_examples: int) -> None:
@@ -61,8 +61,8 @@ class Hook(Contract):
     names it (``hooks = [dict(type="LatencyLog", every=10)]``): installing a package never changes
     what a run does. In training hooks are called on rank 0. ``context`` is the ``RunContext``.
 
-    Every hook is called in a thread of its own, in the order of what happened and a moment after
-    it, and never keeps the run waiting. One that raises, or is more than ``budget_s`` behind, is
+    Every hook is called in a thread of its own, in the order of the events and shortly after them,
+    and never keeps the run waiting. One that raises, or is more than ``budget_s`` behind, is
     reported once and left out for the rest of the run.
     """
 
@@ -72,7 +72,7 @@ class Hook(Contract):
     def budget_s(self) -> float:
         """Seconds that a call may take, with those that wait before it; 2 by default.
 
-        A hook that uploads checkpoints says more. At the end of a run it is waited for as long.
+        A hook that uploads checkpoints sets more. The end of a run waits for it as long.
         """
         return 2.0
 
@@ -123,7 +123,7 @@ class Hook(Contract):
         """
 
     def stopped(self, context: Any, rule: str, problem: str, stamp: float) -> None:
-        """After a safe stop before the task was over: the safety rule, and what it saw."""
+        """After a safe stop before the task was over: the safety rule, and the problem."""
 
     def episode_finished(self, context: Any, reason: str, stamp: float) -> None:
         """After the safe stop that ends every episode; ``reason`` says what ended it."""
@@ -145,3 +145,32 @@ class Command(Contract):
     @abstractmethod
     def run(self, args: Any) -> int:
         """Do it; returns the exit code."""
+
+
+class Reporter:
+    """Receives the messages and progress of a run; this base class drops them all.
+
+    Only rank 0 of a distributed run has one that shows anything.
+    """
+
+    def info(self, text: str) -> None:
+        """One line for people."""
+
+    def warn(self, text: str) -> None:
+        """One line that somebody should read."""
+
+    def progress(self, name: str, done: int, total: int | None, **fields: object) -> None:
+        """``done`` of ``total`` units of ``name``; ``fields`` are shown next to it."""
+
+    def event(self, kind: str, **fields: object) -> None:
+        """One record for programs; ``fields`` are JSON values."""
+
+    def artifact(self, kind: str, path: Path) -> None:
+        """A file or folder that the run made and that somebody will look for."""
+
+    def settle(self) -> None:
+        """Leave the terminal to a person who is asked something: remove progress bars."""
+
+
+class SilentReporter(Reporter):
+    """Drops everything: the default, and what ranks other than 0 get."""

@@ -1,4 +1,4 @@
-"""The contracts of what trains: model, dataset, transform, collator, tokenizer, metric, optimizer.
+"""The contracts of training: model, dataset, transform, collator, tokenizer, metric, optimizer.
 
 Nothing here imports torch: ``VLA`` is inherited together with ``torch.nn.Module``.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from fluxvla_core.contracts.contract import Contract, attribute
 from fluxvla_core.contracts.frame import Sample
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,10 +26,10 @@ class PartWeights:
 
     Args:
         place: a safetensors file, a folder of them, ``hf:<id>``, or a file of ``torch.save``.
-        names: a part of our weights' names -> what stands there instead. Of several the longest
-            counts; weights whose names have none of them are not in the file.
-        unread: parts of names there that nothing here needs. Whatever else is left over is an
-            error, as is whatever is missing.
+        names: a part of our weights' names -> its replacement in the file. The longest match
+            counts; weights without a match are not in the file.
+        unread: parts of names in the file that are not needed. Any other weight that is left over
+            is an error, and so is one that is missing.
     """
 
     place: str
@@ -38,10 +38,10 @@ class PartWeights:
 
 
 class VLA(Contract):
-    """A model, and what training strategies must know of it: ``class MyVLA(VLA, nn.Module)``.
+    """A model, with the facts that training strategies need: ``class MyVLA(VLA, nn.Module)``.
 
-    It has ``forward(...)``, to be trained, whose parameters are keys of a batch, or
-    ``predict_action(...)``, to act.
+    It has ``forward(...)`` for training, whose parameters are keys of a batch, or
+    ``predict_action(...)`` for acting.
     """
 
     forward: Callable[..., Any]
@@ -74,8 +74,8 @@ class VLA(Contract):
 
     @attribute
     def past_actions(self) -> int:
-        """Actions of a chunk that come before the present one's: they are trained on, and left out
-        of what a policy answers. A policy whose chunks have some continues none (``rtc``)."""
+        """Actions of a chunk before the present one's: they are trained on, and left out of a
+        policy's answers. A policy with such actions cannot continue a chunk (``rtc``)."""
         return 0
 
     @attribute
@@ -95,8 +95,8 @@ class VLA(Contract):
     @attribute
     def pretrained_name_or_path(self) -> str | None:
         """The weights that a training starts from: what ``runner.init_from`` takes, for instance
-        another project's checkpoint. The trainer reads them, not the constructor; what a checkpoint
-        of the training holds comes after it."""
+        another project's checkpoint. The trainer reads them, not the constructor; resuming from a
+        checkpoint of the training overwrites them."""
         return None
 
     @attribute
@@ -108,38 +108,38 @@ class VLA(Contract):
     def fsdp_units(self) -> Sequence[Any]:
         """The blocks that are sharded, recomputed and compiled one by one; none by default.
 
-        Each module's ``forward`` must be what the model calls, because that is where sharded
-        weights are gathered and released. Modules that are used together, such as layer ``i`` of a
-        vision-language model and layer ``i`` of the action expert that attends to it (a mixture of
-        transformers), stand in a tuple: they are gathered in one operation before the first of
-        them runs and released after the last.
+        The model must call each module's ``forward``, because sharded weights are gathered and
+        released there. Modules that are used together, such as layer ``i`` of a vision-language
+        model and layer ``i`` of the action expert that attends to it (a mixture of transformers),
+        are a tuple: they are gathered in one operation before the first of them runs and released
+        after the last.
         """
         return []
 
     # -- an answer in two parts, which is what lets it be captured in a CUDA graph ---------------
 
     observe: Callable[..., Mapping[str, Any]]
-    """What every denoising step needs of an observation: name -> tensor.
+    """The inputs of every denoising step that follow from an observation: name -> tensor.
 
     A method; its parameters are those of ``predict_action`` that belong to the observation, and
-    ``noise`` if more noise follows from it. What does not depend on the noisy actions is computed
-    here, once.
+    ``noise`` if more noise follows from it. Everything that does not depend on the noisy actions is
+    computed here, once.
     """
 
     def denoise(self, seen: Mapping[str, Any], noise: Any, tables: Mapping[str, Any]) -> Any:
         """All denoising steps: ``noise`` ``(B, T, D)`` -> normalised actions ``(B, T, D)``.
 
-        ``seen`` is what ``observe`` gave and ``tables`` what ``step_tables`` gave. It only
+        ``seen`` is the result of ``observe`` and ``tables`` that of ``step_tables``. It only
         launches operations on tensors: nothing is read back to the host, and neither the number
         of steps nor a shape depends on a value.
         """
         raise NotImplementedError(f"{type(self).__name__} has no denoise()")
 
     def step_tables(self) -> Mapping[str, Any]:
-        """What the steps need that follows from the weights alone: name -> tensor.
+        """Inputs of the denoising steps that follow from the weights alone: name -> tensor.
 
-        Embeddings of the times of a fixed number of steps, for instance. A policy computes them
-        once, after its weights have been loaded.
+        For example embeddings of the times of a fixed number of steps. A policy computes them once,
+        after its weights have been loaded.
         """
         return {}
 
@@ -161,7 +161,7 @@ class VLA(Contract):
 class Dataset(Contract):
     """Map-style samples; everything random in one follows from (seed, epoch, index).
 
-    What prepares a robot's observations (``inference.dataset``) is an ``InferenceDataset``.
+    A robot's observations are prepared by an ``InferenceDataset`` (``inference.dataset``).
     """
 
     _besides: ClassVar[Mapping[str, int]] = {"__call__": 1}
@@ -189,7 +189,7 @@ class Dataset(Contract):
         return self.get_sample(index, 0)
 
     def prepare(self, reporter: Any) -> None:
-        """Called once before the first sample: decode what is kept in memory."""
+        """Called once before the first sample, for example to decode data into memory."""
 
     def use_seed(self, seed: int) -> None:
         """Draw by the run's seed from now on, unless the config gave one."""
@@ -296,7 +296,7 @@ class _AnyTransform(Contract):
         return []
 
     def denormalizer(self, norm_stats: Mapping[str, Any], statistic_name: str) -> Any:
-        """The transform that undoes what this one does to actions."""
+        """The inverse transform, for actions."""
         raise NotImplementedError(f"{type(self).__name__} normalises no actions")
 
     def defer(self, sample: Sample) -> Sample:
@@ -343,7 +343,7 @@ class Tokenizer(Contract):
         """Token ids."""
 
     def save_pretrained(self, folder: Any) -> Any:
-        """Write what is needed to load it again; goes into checkpoints."""
+        """Write the files to load it from; goes into checkpoints."""
 
     def encode_actions(self, actions: Any) -> Sequence[int]:
         """Token ids of a chunk of normalised actions ``(T, D)``."""
@@ -351,11 +351,11 @@ class Tokenizer(Contract):
 
 
 class Metric(Contract):
-    """Keeps the numbers of a training and hands them to trackers; called on the first rank only."""
+    """Records the numbers of a training and passes them to trackers; called on rank 0 only."""
 
     @abstractmethod
     def start(self, step: int, config: Mapping[str, Any]) -> None:
-        """Training begins, or goes on, after ``step``."""
+        """Training begins, or continues, after ``step``."""
 
     @abstractmethod
     def commit(self, *, global_step: int, epoch: int, loss: float, lr: float, **more: Any) -> None:
@@ -363,11 +363,11 @@ class Metric(Contract):
 
     @abstractmethod
     def push(self) -> Any:
-        """Hand on what was committed since the last time."""
+        """Pass on the numbers committed since the last call."""
 
     @abstractmethod
     def sync(self) -> None:
-        """Make sure that what was pushed outlives the process; before each checkpoint."""
+        """Make everything that was pushed durable; called before each checkpoint."""
 
     @abstractmethod
     def state_dict(self) -> Mapping[str, Any]:
@@ -375,7 +375,7 @@ class Metric(Contract):
 
     @abstractmethod
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Continue from a checkpoint."""
 
     @abstractmethod
     def finalize(self) -> None:

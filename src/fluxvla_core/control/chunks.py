@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.control.safety import BadChunk, SafetySettings
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 # How much further beyond its limits a gripper may be wanted: pressing is how policies hold things.

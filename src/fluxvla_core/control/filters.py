@@ -16,7 +16,7 @@ from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.control.kinematics import Chain, vector
 from fluxvla_core.control.safety import BadCommand
 from fluxvla_core.errors import ConfigError, nearest
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 Columns = npt.NDArray[np.intp]

@@ -25,11 +25,20 @@ class Interrupted(BaseException):
         """The signal's name, for example ``SIGINT``."""
         return signal.Signals(self.number).name
 
-    def final(self) -> BaseException:
-        """The error that ends the command: interrupted (130) after Ctrl-C, else failed (1)."""
+    def final(self, failure: str | None = None) -> BaseException:
+        """The error that ends the command: interrupted (130) after Ctrl-C, else failed (1).
+
+        Args:
+            failure: what went wrong with the robot's stop; None if it was stopped.
+        """
         if self.number == signal.SIGINT:
-            return KeyboardInterrupt("stopped by Ctrl-C; the robot was stopped")
-        return RunFailed(f"stopped by {self.name}; the robot was stopped", reason="stopped")
+            return KeyboardInterrupt(f"stopped by Ctrl-C; {what_became(failure)}")
+        return RunFailed(f"stopped by {self.name}; {what_became(failure)}", reason="stopped")
+
+
+def what_became(failure: str | None) -> str:
+    """What became of the robot, for a message; ``failure`` is of its stop, None if it stopped."""
+    return "the robot was stopped" if failure is None else f"stopping the robot failed: {failure}"
 
 
 class Interrupts:

@@ -61,7 +61,7 @@ import numpy.typing as npt
 from fluxvla_core.control.safety import BadCommand
 from fluxvla_core.control.smoothing import Smoothing
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from fluxvla_core.control.limits import Clamp, CommandLimiter
 from fluxvla_core.control.safety import BadCommand, Latch
 from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]
 Filter = Callable[[Array], Array]

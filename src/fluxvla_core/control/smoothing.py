@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import Joint
+from fluxvla_core.spec import Joint
 
 Array = npt.NDArray[np.float64]
 # Commands that come later than this are no use to a policy that looks at what they did.

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.control.safety import BadFrame, NotFollowing, SafetySettings
-from fluxvla_core.spec.embodiment import VELOCITY, EmbodimentSpec
+from fluxvla_core.spec import VELOCITY, EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 # A prismatic joint's tracking error in m, as a share of a revolute one's in rad.

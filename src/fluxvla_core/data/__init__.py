@@ -47,23 +47,4 @@ if TYPE_CHECKING:
     from fluxvla_core.data.transforms.pipeline import Pipeline as Pipeline
     from fluxvla_core.data.writer import LeRobotWriter as LeRobotWriter
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.data.assemble": ["merge_datasets"],
-        "fluxvla_core.data.dataset": ["ParquetDataset"],
-        "fluxvla_core.data.inference_dataset": ["PrivateInferenceDataset"],
-        "fluxvla_core.data.loader": ["DictCollator"],
-        "fluxvla_core.data.mixture": ["DistributedRepeatingDataset"],
-        "fluxvla_core.data.pretrained": [
-            "PretrainedTokenizer",
-            "model_folder",
-            "resolve_model_path",
-        ],
-        "fluxvla_core.data.sampler": ["SampleKey", "sample_rng"],
-        "fluxvla_core.data.statistics": ["make_affine"],
-        "fluxvla_core.data.transforms.images": ["split_images", "stack_images"],
-        "fluxvla_core.data.transforms.pipeline": ["Pipeline"],
-        "fluxvla_core.data.writer": ["LeRobotWriter"],
-    },
-)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__)

@@ -33,7 +33,7 @@ from fluxvla_core.data.statistics import (
 )
 from fluxvla_core.data.video_encode import CODECS, Clip, join_clips
 from fluxvla_core.errors import DataError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.spec import EmbodimentSpec, check_match
 
 Array = npt.NDArray[Any]
 MEGABYTE = 1024 * 1024

@@ -23,7 +23,7 @@ from fluxvla_core.data.video_decode import (
     check_video,
 )
 from fluxvla_core.errors import DataError, SpecMismatch
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.spec import EmbodimentSpec, check_match
 
 Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]

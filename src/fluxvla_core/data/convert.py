@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.data import lerobot
 from fluxvla_core.data.assemble import (
     MEGABYTE,

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Sample
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.columns import (
     LoadedDataset,
@@ -28,7 +28,7 @@ from fluxvla_core.data.statistics import Stats, as_lists, column_statistics, joi
 from fluxvla_core.data.transforms.images import join_planes, split_images, stack_steps
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import VELOCITY, EmbodimentSpec
+from fluxvla_core.spec import VELOCITY, EmbodimentSpec
 
 Floats = npt.NDArray[np.float32]
 

@@ -19,7 +19,7 @@ from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.data.transforms.images import join_planes, split_images, stack_steps
 from fluxvla_core.data.transforms.pipeline import Pipeline
 from fluxvla_core.errors import ConfigError, FluxError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 HEIGHT, WIDTH = 480, 640
 """Size of an image, where neither the dataset nor the robot says."""

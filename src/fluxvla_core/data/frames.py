@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.data.columns import LoadedDataset, Track
 from fluxvla_core.data.video_decode import FrameReader, Image, Source
 from fluxvla_core.errors import DataError

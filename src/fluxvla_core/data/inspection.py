@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.data import lerobot
 from fluxvla_core.data.columns import Track, check_tasks, make_track, read_columns
 from fluxvla_core.data.files import read_json, read_table, write_metadata

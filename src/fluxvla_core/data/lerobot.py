@@ -32,7 +32,7 @@ from annotated_types import Ge, Le, MaxLen
 
 from fluxvla_core.bounds import Count
 from fluxvla_core.errors import DataError
-from fluxvla_core.spec.embodiment import LARGEST_SIDE, EmbodimentSpec
+from fluxvla_core.spec import LARGEST_SIDE, EmbodimentSpec
 from fluxvla_core.untrusted import checked
 
 VERSION = "v3.0"

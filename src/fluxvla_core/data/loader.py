@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.contracts.training import Collator, Dataset
 from fluxvla_core.data.sampler import (
     DEFAULT_SEED,

@@ -33,7 +33,7 @@ from fluxvla_core.data.files import (
 )
 from fluxvla_core.data.lerobot import check_info, fill
 from fluxvla_core.errors import DataError, nearest
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Ints = npt.NDArray[np.int64]
 FileId = tuple[int, int]

@@ -11,14 +11,14 @@ import numpy.typing as npt
 
 from fluxvla_core.build import RunContext, build_dataset_from_cfg
 from fluxvla_core.contracts.frame import Sample
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.columns import check_compatible, naming_warnings
 from fluxvla_core.data.dataset import ParquetDataset, pooled_statistics
 from fluxvla_core.data.sampler import DEFAULT_SEED, SampleKey, mixture_rng
 from fluxvla_core.data.transforms.pipeline import deferring
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.spec import EmbodimentSpec, check_match
 
 Ints = npt.NDArray[np.int64]
 

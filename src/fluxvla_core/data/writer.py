@@ -34,7 +34,7 @@ from fluxvla_core.data.files import (
 from fluxvla_core.data.statistics import LEVELS, image_histogram
 from fluxvla_core.data.video_encode import Clip, Codec, EpisodeEncoder, find_codec
 from fluxvla_core.errors import DataError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.untrusted import checked
 
 _RECORDING = "recording.json"

@@ -25,20 +25,4 @@ if TYPE_CHECKING:
     from fluxvla_core.evaluation.runner import EvalRunner as EvalRunner
     from fluxvla_core.evaluation.stepping import Diverged as Diverged
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.contracts.environment": [
-            "Environment",
-            "EnvironmentSpec",
-            "Step",
-            "TaskSpec",
-        ],
-        "fluxvla_core.contracts.policy": ["Actor"],
-        "fluxvla_core.evaluation.collect": ["Collection"],
-        "fluxvla_core.evaluation.policies": ["PolicySource", "make_policy", "match_policy"],
-        "fluxvla_core.evaluation.rollout": ["RolloutSettings", "run_episode"],
-        "fluxvla_core.evaluation.runner": ["EvalRunner"],
-        "fluxvla_core.evaluation.stepping": ["Diverged"],
-    },
-)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__)

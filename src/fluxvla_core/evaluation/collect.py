@@ -21,13 +21,13 @@ import numpy.typing as npt
 from fluxvla_core.build import build_environment_from_cfg, build_policy_from_cfg
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
 from fluxvla_core.contracts.policy import Actor
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.control.chunks import not_finite
 from fluxvla_core.errors import ConfigError, DataError, RunFailed, UsageError
 from fluxvla_core.evaluation.policies import match_policy, resolve_policy
 from fluxvla_core.evaluation.pool import Outcome, WorkerPool
 from fluxvla_core.evaluation.stepping import ChunkCommands, Diverged, check_step, shaped
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.spec import Camera, EmbodimentSpec
 from fluxvla_core.untrusted import read_json
 
 META, SETTINGS = "meta", "collection.json"

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.atomic import json_text
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed, UsageError
 from fluxvla_core.evaluation.episodes import DONE, EpisodeKey
 from fluxvla_core.untrusted import read_bytes

@@ -31,7 +31,7 @@ from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError, SafetyStop
 from fluxvla_core.evaluation.stepping import check_step
 from fluxvla_core.ros2 import checked_action
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec
+from fluxvla_core.spec import Camera, EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError, SpecMismatch
-from fluxvla_core.spec.embodiment import Camera, check_match
+from fluxvla_core.spec import Camera, check_match
 
 if TYPE_CHECKING:
     from fluxvla_core.policies.local import LocalPolicy

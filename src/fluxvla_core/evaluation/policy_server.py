@@ -27,7 +27,7 @@ from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy, with_history
 from fluxvla_core.errors import EXIT_BAD_INPUT, ConfigError, FluxError, RunFailed
 from fluxvla_core.policies.local import LocalPolicy, Question
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 Load = Callable[[], LocalPolicy]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import time
 import traceback
 from collections import deque
@@ -22,8 +21,8 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, RunFailed
-from fluxvla_core.plugins.files import load_plugin_files, plugin_files
-from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
+from fluxvla_core.plugins.registry import load_plugin_files, plugin_files
+from fluxvla_core.signals import held_back, leave_stopping_to_the_parent, signal_name
 
 Work = Callable[[Any], Any]
 Factory = Callable[..., Work]
@@ -257,8 +256,7 @@ def _cause(exitcode: int | None) -> str:
     if exitcode is None:
         return "no exit code"
     if exitcode < 0:
-        with suppress(ValueError):
-            return signal.Signals(-exitcode).name
+        return signal_name(-exitcode)
     return f"exit code {exitcode}"
 
 

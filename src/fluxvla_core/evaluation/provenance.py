@@ -21,7 +21,7 @@ from typing import Any
 from fluxvla_core.errors import DataError
 from fluxvla_core.evaluation.collect import META, SETTINGS, SPARE_STRIDE
 from fluxvla_core.plugins import _metadata
-from fluxvla_core.plugins.files import plugin_files
+from fluxvla_core.plugins.registry import plugin_files
 from fluxvla_core.untrusted import checked, read_json
 
 SOURCES = (".py", ".xml")

@@ -14,7 +14,7 @@ from fluxvla_core import atomic
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.config.load import FORMAT as CONFIG_FORMAT
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.evaluation.episodes import DONE, reason
 from fluxvla_core.evaluation.eval_log import EvalLog

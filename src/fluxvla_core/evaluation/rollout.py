@@ -46,7 +46,7 @@ from fluxvla_core.evaluation.stepping import (
     shaped,
 )
 from fluxvla_core.evaluation.videos import VideoRecorder, VideoSettings
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 Array = npt.NDArray[np.float64]
 OnStep = Callable[[Environment, int], None]

@@ -17,8 +17,7 @@ from typing import Any, ClassVar
 
 from fluxvla_core.build import RunContext, bind_options, build_environment_from_cfg
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, TaskSpec
-from fluxvla_core.contracts.reporter import Reporter
-from fluxvla_core.contracts.runner import Runner
+from fluxvla_core.contracts.runner import Reporter, Runner
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation import results_file

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.evaluation.episodes import DONE, EpisodeKey
 from fluxvla_core.evaluation.pool import WorkerPool
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 # Tasks whose groups are all shown.
 _COMPARED = 2

@@ -1,10 +1,9 @@
-"""Index of installed entry points, from one scan of metadata; nothing of theirs is imported.
+"""Index of installed entry points, from one scan of metadata, without importing plugins.
 
-``.dist-info`` folders are read here: to import ``importlib.metadata``, which brings ``email``,
-takes as long as all the rest of ``fluxvla plugins list``. It reads what else there may be (an
-``.egg-info`` with plugins, an archive, what a finder of another library finds). No other module
-imports it: the backport next to the standard library's disables the latter's finder, so one place
-must choose.
+``.dist-info`` folders are read here: importing ``importlib.metadata`` takes as long as all the rest
+of ``fluxvla plugins list``. It reads everything else (an ``.egg-info`` with plugins, an archive,
+distributions of other finders). No other module imports it: importing the backport, too, would
+disable the finder of the standard library's.
 """
 
 from __future__ import annotations
@@ -71,13 +70,13 @@ class Plugin:
 
 @dataclass(frozen=True)
 class Index:
-    """Everything that is installed under a ``fluxvla.`` group, or one that was meant to be.
+    """Everything that is installed under a ``fluxvla.`` group, or a misspelling of one.
 
     Args:
         plugins: (group, name) -> every provider, sorted by distribution.
         broken: one ``where: reason`` line for each distribution that could not be read.
-        folders: canonical name -> ``.dist-info`` folder, of everything that is installed.
-        versions: canonical name -> version, of the distributions whose plugins these are.
+        folders: canonical name -> ``.dist-info`` folder of every installed distribution.
+        versions: canonical name -> version of the distributions with plugins.
     """
 
     plugins: Mapping[tuple[str, str], tuple[Plugin, ...]]
@@ -105,11 +104,8 @@ def intended_group(group: str) -> str | None:
 
 
 def _groups_of(text: str) -> set[str]:
-    """Groups in an ``entry_points.txt`` that are FluxVLA's, also misspelt ones.
-
-    Most files have none, which is seen soonest by its letters.
-    """
-    low = text.lower()
+    """FluxVLA's groups in an ``entry_points.txt``, also misspelt ones."""
+    low = text.lower()  # most files have none, which is seen fastest by these letters
     if PREFIX not in text and "vla" not in low and "flux" not in low:
         return set()
     named = re.findall(r"^[ \t]*\[(.*)\][ \t]*$", text.replace("\r", ""), re.MULTILINE)
@@ -117,16 +113,16 @@ def _groups_of(text: str) -> set[str]:
 
 
 def _is_slip(group: str) -> bool:
-    """Whether a group outside ``fluxvla.`` was meant to be one of the core's."""
+    """Whether a group outside ``fluxvla.`` is a misspelling of one of the core's."""
     return group.lower() == PREFIX.rstrip(".") or intended_group(group) is not None
 
 
 @functools.cache
 def index() -> Index:
-    """The scan. Cached: it is asked for in many places, and lists every folder of ``sys.path``.
+    """The index, from a scan of every folder of ``sys.path``; cached.
 
-    ``FLUXVLA_PLUGINS=ur,fsdp`` sees only those distributions (and the core); empty means none.
-    ``FLUXVLA_BLOCK=ur`` leaves those out. Names may drop the ``fluxvla-`` prefix.
+    ``FLUXVLA_PLUGINS=ur,fsdp`` includes only those distributions (and the core); empty means none.
+    ``FLUXVLA_BLOCK=ur`` excludes those. Names may drop the ``fluxvla-`` prefix.
     """
     plugins: dict[tuple[str, str], list[Plugin]] = {}
     broken: set[str] = set()
@@ -182,7 +178,7 @@ def version(dist: str) -> str | None:
 
 
 def requirements(dist: str) -> tuple[str, ...]:
-    """What a distribution requires (PEP 508); nothing where it is not there or cannot be read."""
+    """The requirements of a distribution (PEP 508); none if it is missing or cannot be read."""
     try:
         found = _distribution(dist)
     except (OSError, ValueError):
@@ -191,12 +187,12 @@ def requirements(dist: str) -> tuple[str, ...]:
 
 
 def with_required(dists: Iterable[str], depth: int, extras: bool = False) -> dict[str, str]:
-    """Versions of the distributions and of what they require, where it is installed; not of what
-    the core requires.
+    """Versions of the distributions and of their installed requirements, except the core's.
 
     Args:
         depth: how many steps to follow requirements.
-        extras: also, in the first step, those of extras, by which plugins name their simulators.
+        extras: also follow, in the first step, requirements of extras: plugins name their
+            simulators there.
     """
     from packaging.requirements import InvalidRequirement, Requirement
 
@@ -249,7 +245,7 @@ class _Folder:
             ValueError: it is a folder, a pipe or the like, larger than such files are, or no UTF-8.
         """
         try:
-            # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
+            # Without O_NONBLOCK, opening a pipe waits for a writer.
             flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
             descriptor = os.open(os.path.join(self.path, name) if name else self.path, flags)
         except (FileNotFoundError, NotADirectoryError):
@@ -269,7 +265,7 @@ class _Folder:
             os.close(descriptor)
 
     def about(self) -> Any:
-        """What it says of its distribution: a :class:`_DistInfo`, or importlib's of an older kind.
+        """The metadata: a :class:`_DistInfo`, or importlib's for an ``.egg-info``.
 
         Raises:
             OSError, ValueError: see :meth:`read_text`.
@@ -289,7 +285,7 @@ class _EntryPoint:
 
 
 class _DistInfo:
-    """What ``importlib.metadata.Distribution`` gives of a ``.dist-info``, as far as it is used."""
+    """The attributes of ``importlib.metadata.Distribution`` that are used, of a ``.dist-info``."""
 
     def __init__(self, folder: _Folder) -> None:
         self._folder = folder
@@ -325,7 +321,7 @@ class _DistInfo:
 
 
 def _distributions() -> Iterator[Any]:
-    """All that are installed, in the order in which one shadows another."""
+    """All installed distributions, in the order in which one shadows another."""
     for place in dict.fromkeys(sys.path):
         try:
             names = os.listdir(place or ".")

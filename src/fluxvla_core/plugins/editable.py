@@ -1,8 +1,7 @@
-"""Editable installations whose ``pyproject.toml`` has other entry points than when they were made.
+"""Editable installations whose ``pyproject.toml`` has got other entry points since.
 
-``pip install -e`` uses the sources in place, but copies the entry points: a plugin that was named
-since is not found, and nothing else says why. Where a distribution was installed from is in its
-``direct_url.json`` (PEP 610).
+``pip install -e`` uses the sources in place, but copies the entry points: a plugin that was added
+later is not found. The source folder of a distribution is in its ``direct_url.json`` (PEP 610).
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Stale:
 
 
 def stale(index: Index) -> Iterator[Stale]:
-    """Every editable installation of ``index`` that does not have its sources' entry points."""
+    """Every editable installation of ``index`` whose entry points differ from its sources'."""
     for name, folder in sorted(index.folders.items()):
         source = _source(folder)
         if source is None or not _metadata.wanted(name):
@@ -75,7 +74,7 @@ def stale(index: Index) -> Iterator[Stale]:
 
 
 def named_since(name: str, index: Index) -> str:
-    """What to say of a plugin ``name`` that sources state and their installation lacks, or ""."""
+    """The message for a plugin ``name`` that sources have and their installation lacks, or ""."""
     for one in stale(index):
         if any(name == stated for _, stated in one.stated.keys() - one.installed.keys()):
             return str(one)
@@ -83,7 +82,7 @@ def named_since(name: str, index: Index) -> str:
 
 
 def _source(folder: str) -> Path | None:
-    """The folder that a ``.dist-info`` was installed from in editable mode; None of others."""
+    """The source folder of a ``.dist-info`` installed in editable mode; None for others."""
     try:
         about = json.loads(Path(folder, _URL).read_text(encoding="utf-8"))
         if not about["dir_info"]["editable"]:
@@ -103,7 +102,7 @@ def _project(source: Path) -> Mapping[str, Any]:
 
     try:
         found = tomli.loads((source / "pyproject.toml").read_text(encoding="utf-8")).get("project")
-    except (OSError, ValueError):  # pip tells more of it
+    except (OSError, ValueError):  # pip reports it
         return {}
     return found if isinstance(found, dict) else {}
 

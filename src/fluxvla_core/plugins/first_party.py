@@ -1,7 +1,7 @@
-"""Names that first-party distributions provide, so that a missing one can be named with its
-pip command. Shipped with the core and never built from what a user typed: suggesting
-``pip install fluxvla-<typo>`` would invite typosquatters. A test compares it with the
-distributions' own pyproject files.
+"""Names that first-party distributions provide, for the pip command in a message.
+
+Shipped with the core and never built from user input: suggesting ``pip install fluxvla-<typo>``
+would invite typosquatters. A test compares it with the distributions' own pyproject files.
 """
 
 from __future__ import annotations

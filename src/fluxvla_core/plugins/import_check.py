@@ -1,13 +1,12 @@
 """Check that plugins can be imported, each distribution in a process of its own.
 
-What an import does (hang, crash, print, change the process) stays there.
+An import may hang, crash, print or change its process.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import time
 import traceback
 from collections import deque
@@ -20,7 +19,7 @@ from fluxvla_core.errors import PluginError
 from fluxvla_core.plugins._metadata import Plugin
 from fluxvla_core.plugins.load import load
 from fluxvla_core.registries import PREFIX
-from fluxvla_core.signals import held_back, leave_stopping_to_the_parent
+from fluxvla_core.signals import held_back, leave_stopping_to_the_parent, signal_name
 
 _AT_ONCE = 2  # importing torch takes a core and half a gigabyte
 
@@ -37,9 +36,9 @@ def problems(
 
     Args:
         plugins: of groups that the core reads.
-        limit_s: for one import. Of a distribution that has one that takes longer, no other module
+        limit_s: for one import. After one that takes longer, no other module of its distribution
             is tried: they may all wait for the same thing.
-        traces: with the tracebacks of what was raised.
+        traces: include tracebacks.
         begins: called with the plugins of each distribution when its turn comes.
     """
     in_order = sorted(plugins, key=lambda p: (p.origin, p.module))
@@ -74,7 +73,7 @@ class _Importer:
     Attributes:
         connection: readable when there is an answer.
         deadline: of the import under way, on the monotonic clock.
-        rest: the plugins that another process is to try, once this one is ``done``.
+        rest: plugins for another process to try, once this one is ``done``.
     """
 
     def __init__(self, plugins: Plugins, limit_s: float, traces: bool) -> None:
@@ -137,7 +136,7 @@ class _Importer:
 
 
 def _import(connection: Connection, plugins: Plugins, traces: bool) -> None:
-    """A process's life: one answer a plugin, empty if all is well with it."""
+    """The process: sends one problem per plugin, empty if there is none."""
     leave_stopping_to_the_parent()
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
@@ -156,5 +155,5 @@ def _problem(plugin: Plugin, traces: bool) -> str:
 
 def _cause(exitcode: int | None) -> str:
     if exitcode is not None and exitcode < 0:
-        return signal.Signals(-exitcode).name
+        return signal_name(-exitcode)
     return f"exit status {exitcode}"

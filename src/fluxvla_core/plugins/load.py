@@ -1,6 +1,6 @@
 """Load a plugin class by name: find the one plugin that provides it, check it, import it.
 
-Also where a module's source file is, for those who read it and import nothing.
+``locate`` finds the source file of a module without importing it.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _COMPARE: Final[Mapping[str, Any]] = {
 def find(group: str, name: str, also: tuple[str, ...] = ()) -> Plugin:
     """The one installed plugin called ``name``, or ``distribution:name``.
 
-    A name that the core provides means the core's, whoever else provides it; theirs is reached as
-    ``distribution:name``. To install a package must not change what a config means.
+    A name that the core provides always means the core's; another distribution's is reached as
+    ``distribution:name``. Installing a package must not change the meaning of a config.
 
     Args:
         also: names registered in this process, offered with the installed ones.
@@ -73,7 +73,7 @@ def core_provides(group: str, name: str) -> bool:
 
 
 def choose(plugins: Sequence[Plugin]) -> str:
-    """How to say which of several plugins of one name is meant."""
+    """The advice for choosing one of several plugins with the same name."""
     names = [f"{p.dist}:{p.name}" for p in plugins]
     if plugins[0].group == PREFIX + "commands":
         ways = " or ".join(f"fluxvla {name}" for name in names)
@@ -105,9 +105,9 @@ def _missing(group: str, name: str, short: str, also: tuple[str, ...]) -> tuple[
 
 
 def not_read(name: str) -> str:
-    """What to say of a plugin called ``name`` that is somewhere, and not to be found, or "".
+    """The message for a plugin ``name`` that is installed and cannot be found, or "".
 
-    It stands in a group that nothing reads, or in a ``pyproject.toml`` that changed since the
+    It is in a group that nothing reads, or in a ``pyproject.toml`` that changed since the
     distribution was installed.
     """
     for (group, found), providers in sorted(_metadata.index().plugins.items()):
@@ -119,28 +119,28 @@ def not_read(name: str) -> str:
 
 
 def unread_group(plugin: Plugin) -> str:
-    """That nothing reads a plugin's group, and which one its author may have meant."""
+    """The message for a plugin in a group that nothing reads, with the nearest group."""
     meant = _metadata.intended_group(plugin.group)
     hint = f"; did its author mean {meant!r}?" if meant else ""
     return f"{plugin.origin}: {plugin.name} is in {plugin.group!r}, which nothing reads{hint}"
 
 
 EXACT: Final = frozenset({"transformers"})
-"""Distributions whose modules models are made of: with another version than a plugin declares, the
-same weights may give other numbers, and nobody would notice."""
+"""Distributions that models are built from: with another version than a plugin declares, the same
+weights may silently give other numbers."""
 
 
 def unmet(plugin: Plugin) -> str | None:
     """Why the plugin's own requirement on the core, or on one of ``EXACT``, does not hold, or None.
 
-    ``pip install --no-deps``, conda and ROS overlays go past pip's check, so it is made again.
+    ``pip install --no-deps``, conda and ROS overlays bypass pip's check, so it is repeated.
     """
     found = _first_unmet(plugin)
     return None if found is None else found[0]
 
 
 def upgrade(plugin: Plugin) -> str:
-    """The command after which :func:`unmet` holds no more."""
+    """The pip command that fixes :func:`unmet`."""
     found = _first_unmet(plugin)
     wanted = "" if found is None else found[1]
     return f"pip install {wanted}" if wanted else f"pip install --upgrade {plugin.dist} {CORE}"
@@ -162,8 +162,8 @@ def _first_unmet(plugin: Plugin) -> tuple[str, str] | None:
 def _unmet(
     origin: str, requires: tuple[str, ...], name: str, have: str | None
 ) -> tuple[str, str] | None:
-    """Why ``have`` of the distribution ``name`` is not enough, and what pip should install; the
-    latter is empty for the core, which several plugins require."""
+    """Why version ``have`` of ``name`` is not accepted, and the requirement for pip; the latter is
+    empty for the core, which several plugins require."""
     if have and _certainly_met(requires, name, have):
         return None
     from packaging.requirements import InvalidRequirement, Requirement
@@ -188,7 +188,7 @@ def _unmet(
 def _certainly_met(requires: tuple[str, ...], dist: str, have: str) -> bool:
     """Whether ``have`` of ``dist`` fulfils plain ranges such as ``fluxvla-core>=0.1,<0.2``.
 
-    Importing ``packaging`` takes a third of ``fluxvla config check``; it decides about all else.
+    Importing ``packaging``, which decides all other cases, takes a third of ``config check``.
     """
     release = r"\d+(?:\.\d+)*"
     if not re.fullmatch(release, have):
@@ -260,8 +260,8 @@ def load(plugin: Plugin) -> Any:
 
 
 def _where(error: BaseException, module: str) -> str:
-    """`` (package/module.py:line)``: the last place in ``module``'s package on the way to it."""
-    import traceback  # `fluxvla --help` has no use for it
+    """`` (package/module.py:line)``: the last frame in ``module``'s package."""
+    import traceback  # slow to import
 
     if isinstance(error, SyntaxError) and error.filename:
         return f" ({place(Path(error.filename), module, error.lineno or 1)})"

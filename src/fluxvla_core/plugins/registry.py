@@ -1,11 +1,18 @@
-"""Registries: a view over one entry-point group plus what this process registered itself."""
+"""Registries: views over entry-point groups, and the classes that this process registered itself.
+
+``--plugin FILE`` registers the classes of a Python file. A worker process is a new interpreter: it
+loads what :func:`plugin_files` names in its parent.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import importlib.util
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from fluxvla_core.errors import LoadFailed, PluginError
+from fluxvla_core.errors import FluxError, LoadFailed, PluginError, UsageError
 from fluxvla_core.plugins import _metadata
 from fluxvla_core.plugins._metadata import Plugin, canonical
 from fluxvla_core.plugins.load import core_provides, find, load
@@ -13,9 +20,13 @@ from fluxvla_core.registries import PREFIX, ROWS
 
 T = TypeVar("T", bound=Callable[..., Any])
 
+PLUGIN_FILE = "fluxvla_plugin_"
+"""Prefix of the names of the modules that are made from plugin files."""
+_loaded: dict[str, Path] = {}  # module -> its file
+
 
 class Registry:
-    """Names to classes. Installed ones are imported when asked for by name, never before."""
+    """Names to classes. An installed class is imported when it is first requested by name."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -59,8 +70,7 @@ class Registry:
     def get(self, name: str) -> Any:
         """The class called ``name`` (or ``distribution:name``).
 
-        What this process registered comes first: it is the nearer intention. A load failure is
-        remembered and raised again as it was.
+        A class registered in this process comes first. A load failure is kept and raised again.
 
         Raises:
             PluginError: nothing, or more than one, provides the name, or it cannot be loaded.
@@ -94,7 +104,7 @@ class Registry:
         self._here.pop(name, None)
 
     def _check(self, cls: Any, origin: str) -> None:
-        # Who only lists names, or checks a config, needs no contracts.
+        # Not needed to list names or to check a config.
         from fluxvla_core.contracts.check import check_class
 
         check_class(self.name, cls, origin)
@@ -140,3 +150,62 @@ if TYPE_CHECKING:  # the names that the table makes; a test compares them
     COMMANDS: Registry
 else:
     globals().update({row.constant: BY_NAME[row.name] for row in ROWS})
+
+
+# -- plugin files ----------------------------------------------------------------------------------
+
+
+def load_plugin_files(files: Iterable[str | Path]) -> None:
+    """Execute each file as a module of its own.
+
+    Raises:
+        UsageError: it is missing, or is not a Python file.
+        LoadFailed: it raises, or registers a class that breaks a contract.
+    """
+    for path in map(Path, files):
+        if not path.is_file():
+            raise UsageError(f"--plugin {path}: there is no such file")
+        if path.suffix != ".py":
+            raise UsageError(f"--plugin {path}: not a .py file")
+        _execute(path)
+
+
+def plugin_files() -> tuple[str, ...]:
+    """Absolute paths of the files that this process loaded, in their order."""
+    return tuple(str(path.resolve()) for path in _loaded.values())
+
+
+def forget_plugin_files() -> None:
+    """Unregister what the files registered; for tests."""
+    for registry in BY_NAME.values():
+        for key in list(registry):
+            if getattr(registry.registered(key), "__module__", "") in _loaded:
+                registry.unregister(key)
+    for module in _loaded:
+        sys.modules.pop(module, None)
+    _loaded.clear()
+
+
+def _execute(path: Path) -> None:
+    module = f"{PLUGIN_FILE}{path.stem}".replace("-", "_")
+    spec = importlib.util.spec_from_file_location(module, path)
+    if spec is None or spec.loader is None:
+        raise UsageError(f"--plugin {path}: Python cannot load it")
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[module] = loaded
+    try:
+        spec.loader.exec_module(loaded)
+    except BaseException as error:
+        del sys.modules[module]
+        if isinstance(error, FluxError) or not isinstance(error, (Exception, SystemExit)):
+            raise
+        import traceback
+
+        steps = traceback.extract_tb(error.__traceback__)
+        lines = [s.lineno for s in steps if Path(s.filename).resolve() == path.resolve()]
+        line = lines[-1] if lines else getattr(error, "lineno", None)
+        raise LoadFailed(
+            f"--plugin {path}: raised {type(error).__name__}: {error}",
+            where=f"{path}:{line}" if line else str(path),
+        ) from error
+    _loaded[module] = path

@@ -33,7 +33,7 @@ from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.plugins._metadata import version
 from fluxvla_core.policies.local import LocalPolicy, Question
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     import torch

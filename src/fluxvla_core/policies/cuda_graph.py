@@ -14,7 +14,7 @@ than it takes the host to launch it. A graph removes that. After torch's notes o
   numbers (the noise is an input), so that there is no generator state to register.
 
 It needs a GPU. What captures and what does not is tested on CPUs by
-``fluxvla_core.testing.capture.Tape``, which has the same interface and replays operation by
+``fluxvla_core.testing.execution.Tape``, which has the same interface and replays operation by
 operation.
 """
 

@@ -16,7 +16,7 @@ from fluxvla_core.build import (
     parameters,
 )
 from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, newest_whole
-from fluxvla_core.config.snapshot import work_dirs_below
+from fluxvla_core.config.load import work_dirs_below
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import InferenceDataset, Transform
 from fluxvla_core.data.inference_dataset import PrivateInferenceDataset
@@ -26,7 +26,7 @@ from fluxvla_core.data.preparation import try_preparation
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, located
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, VLAS, Registry
 from fluxvla_core.policies.local import LocalPolicy
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 log = logging.getLogger("fluxvla.policies")
 

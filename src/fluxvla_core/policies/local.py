@@ -15,7 +15,7 @@ from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError, DataError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
     from fluxvla_core.policies.execution import Transfer

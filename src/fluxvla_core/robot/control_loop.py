@@ -24,7 +24,7 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.chunks import Chunk, check_beginning
 from fluxvla_core.control.interrupt import Interrupts
 from fluxvla_core.control.joiners import ChunkJoiner

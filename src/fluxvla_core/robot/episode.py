@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.clock import Rate
 from fluxvla_core.control.delays import MACHINE
 from fluxvla_core.control.interrupt import Interrupted, Interrupts

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.control.safety import BadFrame
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 
 def as_frame(value: Any, source: str) -> Frame:

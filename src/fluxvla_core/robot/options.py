@@ -14,7 +14,7 @@ from fluxvla_core.control.filters import SnapGripper
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.errors import ConfigError, SpecMismatch
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.spec import EmbodimentSpec, check_match
 
 
 @dataclass(frozen=True, kw_only=True)

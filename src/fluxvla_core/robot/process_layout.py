@@ -20,7 +20,7 @@ from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS, RUNNERS
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import import_path, not_plain
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Embodiment: TypeAlias = "EmbodimentSpec | Mapping[str, Any] | None"
 

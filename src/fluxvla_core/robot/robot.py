@@ -27,7 +27,7 @@ from fluxvla_core.control.delays import DelayMonitor, robot_call
 from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, LoadFailed, SpecMismatch
 from fluxvla_core.robot.operator_values import as_action, as_frame, as_number, as_state
-from fluxvla_core.spec.embodiment import NO_SPEEDS, EmbodimentSpec, check_match, speeds
+from fluxvla_core.spec import NO_SPEEDS, EmbodimentSpec, check_match, speeds
 
 # How long a safe stop may take before the message says to use the emergency stop.
 STOP_S = 5.0

@@ -231,7 +231,7 @@ class BaseInferenceRunner(Runner):
                 ended = "ok"
             except Interrupted as signal:
                 ended = "interrupted"
-                raise signal.final() from None
+                raise signal.final(engine.stop_failure) from None
             finally:
                 interrupts.stopping = True
                 self._shut_down(thread)

@@ -44,39 +44,4 @@ if TYPE_CHECKING:
     from fluxvla_core.ros2.streams import depth_stream as depth_stream
     from fluxvla_core.ros2.sync import Stale as Stale
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.ros2.stop_motion": ["checked_action"],
-        "fluxvla_core.ros2.connection": ["Connection", "require_rclpy"],
-        "fluxvla_core.ros2.faults": ["AMOUNTS", "Fault", "Faults", "MODES", "Outbox"],
-        "fluxvla_core.contracts.frame": ["RobotFrame"],
-        "fluxvla_core.ros2.images": ["images"],
-        "fluxvla_core.ros2.joints": ["joints"],
-        "fluxvla_core.ros2.messages": [
-            "BadMessage",
-            "COMPRESSED_IMAGE",
-            "FLOAT64",
-            "FLOAT64_ARRAY",
-            "IMAGE",
-            "JOINT_STATE",
-            "ODOMETRY",
-            "TWIST",
-            "message_class",
-        ],
-        "fluxvla_core.ros2.operator": ["RosOperator"],
-        "fluxvla_core.ros2.qos": ["qos"],
-        "fluxvla_core.ros2.streams": [
-            "AUXILIARY",
-            "CAMERA",
-            "CommandSpec",
-            "DEPTH",
-            "STATE",
-            "StreamSpec",
-            "camera_stream",
-            "depth_stream",
-        ],
-        "fluxvla_core.ros2.sync": ["Stale"],
-    },
-    deprecated={"SIDE": "AUXILIARY"},
-)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__, {"SIDE": "AUXILIARY"})

@@ -24,12 +24,11 @@ from fluxvla_core.contracts.frame import STATE as STATE_STREAM
 from fluxvla_core.contracts.frame import RobotFrame
 from fluxvla_core.contracts.robot import Operator, Part
 from fluxvla_core.errors import ConfigError, Faulted, FluxError, NotReady
-from fluxvla_core.ros2 import discovery, frames
+from fluxvla_core.ros2 import discovery
 from fluxvla_core.ros2.connection import Connection
-from fluxvla_core.ros2.messages import message_class
-from fluxvla_core.ros2.startup import StartupChecks, wait_for_reading
+from fluxvla_core.ros2.startup import StartupChecks, open_topics, wait_for_reading
 from fluxvla_core.ros2.stop_motion import Motion, attempt, checked_action, wait_for_receipt
-from fluxvla_core.ros2.stream_reader import StreamReader
+from fluxvla_core.ros2.stream_reader import StreamReader, TimedImages
 from fluxvla_core.ros2.streams import (
     CAMERA,
     DEPTH,
@@ -39,13 +38,15 @@ from fluxvla_core.ros2.streams import (
     Stream,
     StreamSpec,
 )
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger("fluxvla.ros2")
 
 # Ends the names of the nodes, so that people who look at the graph know which is which.
 _NODE = {Part.WHOLE: "", Part.WITHOUT_CAMERAS: "_control", Part.WITHOUT_COMMANDS: "_cameras"}
+# What subclasses may override, under the names that it had.
+_RENAMED = {"pictures_after": "images_after", "admit": "check_command"}
 
 
 class RosOperator(Operator):
@@ -75,18 +76,14 @@ class RosOperator(Operator):
     ) -> None:
         if sync_on not in ("stamp", "receipt"):
             raise ConfigError(f"sync_on is 'stamp' or 'receipt', got {sync_on!r}")
-        bounds = {
-            "connect_timeout_s": connect_timeout_s,
-            "max_age_s": max_age_s,
-            "max_skew_s": max_skew_s,
-        }
-        for name, value in bounds.items():
-            if not 0 < value < float("inf"):
-                raise ConfigError(f"{name} must be a positive number of seconds, got {value!r}")
         self.domain_id = domain_id
         self.connect_timeout_s = connect_timeout_s
         self.max_age_s = max_age_s
         self.max_skew_s = max_skew_s
+        for name in ("connect_timeout_s", "max_age_s", "max_skew_s"):
+            if not 0 < getattr(self, name) < float("inf"):
+                said = f"{name} must be a positive number of seconds, got {getattr(self, name)!r}"
+                raise ConfigError(said)
         self.sync_on = sync_on
         self.rate_window_s = rate_window_s
         # Re-entrant: a signal handler may call stop() in the thread that is sending.
@@ -147,14 +144,11 @@ class RosOperator(Operator):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "pictures_after" in vars(cls) and "images_after" not in vars(cls):
-            message = f"{cls.__name__}.pictures_after is deprecated, name it images_after"
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
-            cls.images_after = vars(cls)["pictures_after"]  # type: ignore[method-assign]
-        if "admit" in vars(cls):
-            message = f"{cls.__name__}.admit is deprecated, call it check_command"
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
-            cls.check_command = vars(cls)["admit"]  # type: ignore[method-assign]
+        for old, name in _RENAMED.items():
+            if old in vars(cls) and name not in vars(cls):
+                message = f"{cls.__name__}.{old} is deprecated, name it {name}"
+                warnings.warn(message, DeprecationWarning, stacklevel=2)
+                setattr(cls, name, vars(cls)[old])
 
     # Methods of the Operator contract.
 
@@ -224,7 +218,7 @@ class RosOperator(Operator):
         states = {spec.name: matched[spec.name] for spec in self._specs if spec.kind == STATE}
         state, stamp = self._state_of(states)
         stamps = {name: found.receipt for name, found in matched.items() if name not in states}
-        colours, depths = frames.pictures(self._specs, matched)
+        colours, depths = reader.frame_images(matched)
         newest = {name: received.message for name, received in reader.newest().items()}
         return RobotFrame(
             state, colours, {**stamps, STATE_STREAM: stamp}, depths, self.read_base(newest)
@@ -254,9 +248,7 @@ class RosOperator(Operator):
         """
         return min(received.receipt for received in self._reader.states().values())
 
-    def images_after(
-        self, camera: str, after: float
-    ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
+    def images_after(self, camera: str, after: float) -> TimedImages:
         """Images that a camera sent after a time, for recordings; any thread may call it.
 
         Args:
@@ -269,17 +261,13 @@ class RosOperator(Operator):
         Raises:
             BadMessage: an image has another size or encoding than its camera.
         """
-        connection = self._connection
-        if connection is None:
+        if self._connection is None:
             return [], 0
-        return frames.images_after(connection, self._specs, camera, after)
+        return self._stream_reader.images_after(camera, after)
 
-    def pictures_after(
-        self, camera: str, after: float
-    ) -> tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]:
+    def pictures_after(self, camera: str, after: float) -> TimedImages:
         """Deprecated name of :meth:`images_after`."""
-        message = "RosOperator.pictures_after is deprecated, use images_after"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        warnings.warn("pictures_after is deprecated, use images_after", DeprecationWarning, 2)
         return RosOperator.images_after(self, camera, after)
 
     def send_action(self, action: npt.ArrayLike) -> None:
@@ -400,16 +388,10 @@ class RosOperator(Operator):
         cameras = () if self._part.cameras else (CAMERA, DEPTH)
         self._specs = tuple(spec for spec in self.streams() if spec.kind not in cameras)
         commands = tuple(self.commands()) if self._part.commands else ()
-        for spec in self._specs:
-            message = message_class(spec.message)
-            connection.subscribe(spec.name, spec.topic, message, spec.depth, spec.latched)
         self._stream_reader = StreamReader(
             connection, self._specs, self.max_age_s, self.max_skew_s, self.sync_on
         )
-        self._publishers = {
-            command.topic: connection.publisher(command.topic, message_class(command.message))
-            for command in commands
-        }
+        self._publishers = open_topics(connection, self._specs, commands)
         startup = StartupChecks(connection, self._specs, commands, self._publishers)
         startup.run(self.connect_timeout_s, self.rate_window_s)
         if not self._part.commands:

@@ -21,7 +21,7 @@ from typing import Any
 from fluxvla_core.errors import FluxError, NotReady
 from fluxvla_core.ros2 import discovery
 from fluxvla_core.ros2.connection import LARGE_FRAMES, Connection
-from fluxvla_core.ros2.messages import type_name
+from fluxvla_core.ros2.messages import message_class, type_name
 from fluxvla_core.ros2.qos import BEST_EFFORT, RELIABLE
 from fluxvla_core.ros2.stream_reader import POLL_S
 from fluxvla_core.ros2.streams import CAMERA, DEPTH, CommandSpec, Stream, StreamSpec
@@ -36,6 +36,23 @@ ENOUGH = 0.5
 """Share of the messages that has to arrive for a stream to be used at all."""
 GOOD = 0.9
 """Share below which somebody should know."""
+
+
+def open_topics(
+    connection: Connection, specs: Iterable[StreamSpec], commands: Iterable[CommandSpec]
+) -> dict[str, Any]:
+    """Subscribe to all streams; returns topic -> publisher, for each of ``commands``.
+
+    Raises:
+        LoadFailed: a message package is missing.
+    """
+    for spec in specs:
+        message = message_class(spec.message)
+        connection.subscribe(spec.name, spec.topic, message, spec.depth, spec.latched)
+    return {
+        command.topic: connection.publisher(command.topic, message_class(command.message))
+        for command in commands
+    }
 
 
 class StartupChecks:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fluxvla_core.control.limits import CommandLimiter
 from fluxvla_core.control.tracking import HOLD_REACH
 from fluxvla_core.errors import Rejected
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger("fluxvla.ros2")

@@ -1,15 +1,21 @@
-"""The newest messages of an operator's streams: checked for age, matched in time."""
+"""The newest messages of an operator's streams: checked for age, matched in time, as images."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-from fluxvla_core.ros2 import discovery, sync
+import numpy as np
+import numpy.typing as npt
+
+from fluxvla_core.ros2 import discovery, images, sync
 from fluxvla_core.ros2.connection import Connection
 from fluxvla_core.ros2.streams import CAMERA, DEPTH, STATE, Received, StreamSpec
 from fluxvla_core.ros2.sync import Stale
+from fluxvla_core.spec import Camera
 
+TimedImages = tuple[list[tuple[float, npt.NDArray[np.uint8]]], int]
 # How often a wait for messages that belong together looks again.
 POLL_S = 0.002
 
@@ -108,8 +114,55 @@ class StreamReader:
             else:
                 return match.messages
 
+    def frame_images(
+        self, messages: Mapping[str, Received]
+    ) -> tuple[dict[str, npt.NDArray[np.uint8]], dict[str, npt.NDArray[np.float32]]]:
+        """The colour and depth images of a frame, by camera name, in fresh arrays.
+
+        Args:
+            messages: stream -> the message to convert; of ``matched``.
+
+        Raises:
+            BadMessage: an image has another size or encoding than its camera; names stream and
+                topic.
+        """
+        colours: dict[str, npt.NDArray[np.uint8]] = {}
+        depths: dict[str, npt.NDArray[np.float32]] = {}
+        for spec in self._specs:
+            if spec.camera is None:
+                continue
+            message = messages[spec.name].message
+            if spec.kind == CAMERA:
+                colours[spec.camera.name] = _rgb(spec, spec.camera, message)
+            elif spec.kind == DEPTH:
+                depths[spec.camera.name] = images.to_depth(
+                    message, spec.camera.height, spec.camera.width, spec.label
+                )
+        return colours, depths
+
+    def images_after(self, camera: str, after: float) -> TimedImages:
+        """The colour images of a camera that are newer than ``after``: see ``RosOperator``.
+
+        None for a camera that has no stream.
+        """
+        for spec in self._specs:
+            if spec.kind == CAMERA and spec.camera is not None and spec.camera.name == camera:
+                ring = self._connection.streams[spec.name].ring
+                found = [
+                    (received.receipt, _rgb(spec, spec.camera, received.message))
+                    for received in ring.items()
+                    if received.receipt > after
+                ]
+                return found, ring.received - ring.duplicates - ring.overtaken
+        return [], 0
+
     def _clock_stepped(self) -> bool:
         """Whether a sender's clock stepped so recently that stamps on both sides are kept."""
         since = time.monotonic() - self._max_age
         steps = [stream.ring.stepped_at for stream in self._connection.streams.values()]
         return any(at is not None and at > since for at in steps)
+
+
+def _rgb(spec: StreamSpec, camera: Camera, message: Any) -> npt.NDArray[np.uint8]:
+    grey = camera.encoding in images.GREY
+    return images.to_rgb(message, camera.height, camera.width, spec.label, grey)

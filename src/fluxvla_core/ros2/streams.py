@@ -12,7 +12,7 @@ from typing import Any
 
 from fluxvla_core.ros2 import qos
 from fluxvla_core.ros2.messages import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, stamp_of
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 
 STATE, CAMERA, DEPTH, AUXILIARY = "state", "camera", "depth", "auxiliary"
 """Kinds of streams. Auxiliary ones (a robot's mode, its base) must be fresh, but their messages are

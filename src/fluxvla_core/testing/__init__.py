@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fluxvla_core import _lazy
@@ -28,27 +29,12 @@ if TYPE_CHECKING:
     from fluxvla_core.testing.train_runner import TrainRunnerConformance as TrainRunnerConformance
     from fluxvla_core.testing.transform import TransformConformance as TransformConformance
 
-_KITS = {
-    "fluxvla_core.testing.action_filter": ["ActionFilterConformance"],
-    "fluxvla_core.testing.dataset": ["DatasetConformance"],
-    "fluxvla_core.testing.environment": ["EnvironmentConformance"],
-    "fluxvla_core.testing.execution": ["ExecutionConformance"],
-    "fluxvla_core.testing.eval_runner": ["EvalRunnerConformance"],
-    "fluxvla_core.testing.hook": ["HookConformance"],
-    "fluxvla_core.testing.inference_runner": ["InferenceRunnerConformance"],
-    "fluxvla_core.testing.metric": ["MetricConformance"],
-    "fluxvla_core.testing.model": ["ModelConformance"],
-    "fluxvla_core.testing.operator": ["OperatorConformance"],
-    "fluxvla_core.testing.policy": ["PolicyConformance"],
-    "fluxvla_core.testing.stand_ins": ["StandInPolicy", "StandInRobot"],
-    "fluxvla_core.testing.train_runner": ["TrainRunnerConformance"],
-    "fluxvla_core.testing.transform": ["TransformConformance"],
-}
 if "pytest" in sys.modules:
     import pytest
 
-    # Assertions of the kits then show their values, besides what they say.
-    _shared = ("fluxvla_core.testing._conformance", "fluxvla_core.testing._operator_parts")
-    pytest.register_assert_rewrite(*_shared, *_KITS)
+    # Assertions of the kits then show their values, besides their messages.
+    pytest.register_assert_rewrite(
+        *(f"{__name__}.{p.stem}" for p in Path(__file__).parent.glob("*.py"))
+    )
 
-__getattr__, __dir__, __all__ = _lazy.attach(__name__, _KITS)
+__getattr__, __dir__, __all__ = _lazy.attach(__name__)

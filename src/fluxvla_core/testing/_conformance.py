@@ -1,4 +1,4 @@
-"""What the conformance kits share: how a component is made, and the checks of its class."""
+"""Base of the conformance kits: building a component, and the checks of its class."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Conformance(Renamed):
         return cls
 
     def make(self) -> Any:
-        """A new one, as it is; override it for one that takes more than ``arguments``."""
+        """A new component; override it for one that takes more than ``arguments``."""
         cls, problem = self.component(), ""
         try:
             inspect.signature(cls).bind(**self.arguments)
@@ -65,7 +65,7 @@ class Conformance(Renamed):
         return cls(**self.arguments)
 
     def stated(self) -> dict[str, Any]:
-        """What the constructor is called with, and its defaults where it is not."""
+        """The arguments of the constructor, with its defaults."""
         parameters = inspect.signature(self.component()).parameters.values()
         defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
         return {**defaults, **self.arguments}
@@ -105,12 +105,12 @@ def capability(has: bool, what: str) -> None:
 
 @contextmanager
 def calling(what: str, given: Mapping[str, Any], hint: str) -> Iterator[None]:
-    """Whatever is raised inside says what was called, and with values of which shapes.
+    """Report an error raised inside with the call and the shapes of its arguments.
 
     Args:
-        what: the call, as people write it.
+        what: the call, as source.
         given: name -> value.
-        hint: what of the kit decides about these values.
+        hint: how the kit chooses these values.
 
     Raises:
         AssertionError: something was raised inside.

@@ -1,4 +1,4 @@
-"""What the checks of operators share, and those of an operator that two processes divide."""
+"""Helpers of the operator kit, and its checks of an operator that two processes divide."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import NotReady, OperatorError, Rejected
 from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 # No command in this time means that no more are under way.
@@ -24,7 +24,7 @@ _APART, STEP = 0.01, 0.03
 
 
 class DividedOperatorChecks:
-    """Base of the kit of operators: ``parts`` and what is expected of them."""
+    """Base of the kit of operators: ``parts`` and their checks."""
 
     entry_point: ClassVar[str]
     arguments: ClassVar[Mapping[str, Any]] = {}
@@ -222,22 +222,22 @@ class DividedOperatorChecks:
 
 
 def not_followed(spec: EmbodimentSpec, column: int, step: float, moved: Array) -> str:
-    """What a state that did not follow a command to ``step`` of its ``column`` looks like."""
+    """The message for a state whose ``column`` did not follow a command by ``step``."""
     name = spec.state_names[column]
-    told = f"send_action() moves {name} by {step:.4g}, and "
+    sent = f"send_action() moves {name} by {step:.4g}, and "
     why = ": the arm is watched by its state, and a policy is asked with it"
     others = np.abs(moved)
     others[column] = 0.0
     furthest = int(others.argmax())
     if np.abs(moved).max() < abs(step) / 100.0:
-        return f"{told}the state did not change, expected {name} to follow{why}"
+        return f"{sent}the state did not change, expected {name} to follow{why}"
     if others[furthest] > abs(step) / 2.0:
         return (
-            f"{told}the state of {spec.state_names[furthest]} changed by {moved[furthest]:.4g}, "
+            f"{sent}the state of {spec.state_names[furthest]} changed by {moved[furthest]:.4g}, "
             f"that of {name} by {moved[column]:.4g}; expected {name} alone: are the columns in the "
             f"order of the joint names, {', '.join(spec.state_names)}"
             "?"
         )
     ratio = moved[column] / step
     unit = " (degrees for radians?)" if abs(ratio - 180.0 / np.pi) < 10.0 else ""
-    return f"{told}its state changed by {moved[column]:.4g}, {ratio:.3g} times that{unit}{why}"
+    return f"{sent}its state changed by {moved[column]:.4g}, {ratio:.3g} times that{unit}{why}"

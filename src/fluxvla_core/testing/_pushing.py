@@ -1,4 +1,4 @@
-"""A point that is pushed left or right, and who pushes it: for the kit of evaluation runners.
+"""An environment in which a point is pushed left or right, and policies: for EvalRunnerConformance.
 
 Loaded as a plugin file, so that worker processes load it too.
 """
@@ -15,7 +15,7 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec, Ste
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.plugins.registry import ENVIRONMENTS, POLICIES
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 SIDES = {"left": -1.0, "right": 1.0}
 _STEPS, _STRIDE = 12, 0.1
@@ -87,7 +87,7 @@ class _Pusher(Actor):
 
 @POLICIES.register_module()
 class KitListener(_Pusher):
-    """Does what the instruction says, and so succeeds at every task."""
+    """Follows the instruction, and so succeeds at every task."""
 
     def predict_action(self, observation: Observation) -> npt.NDArray[np.float64]:
         said = observation["task_description"]

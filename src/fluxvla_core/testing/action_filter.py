@@ -21,7 +21,7 @@ import pytest
 
 from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 from fluxvla_core.testing._conformance import Conformance
 
 Array = npt.NDArray[np.float64]
@@ -74,7 +74,7 @@ class ActionFilterConformance(Conformance):
         return found
 
     def course(self, filter: ActionFilter) -> Array:
-        """What it makes of ``targets``, from the middle of all limits."""
+        """The filtered ``targets``, from the middle of all limits."""
         filter.reset(self.middle())
         return np.stack([np.array(filter(target.copy()), float) for target in self.targets()])
 

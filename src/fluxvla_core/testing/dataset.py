@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 
 from fluxvla_core.contracts.contract import implements
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.sampler import SampleKey
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.testing._conformance import (
     Conformance,
     as_array,

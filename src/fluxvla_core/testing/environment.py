@@ -27,7 +27,7 @@ from fluxvla_core.evaluation.policies import RandomPolicy
 from fluxvla_core.evaluation.rollout import RolloutSettings, run_episode
 from fluxvla_core.evaluation.stepping import Diverged
 from fluxvla_core.plugins.registry import ENVIRONMENTS, POLICIES
-from fluxvla_core.spec.embodiment import Camera
+from fluxvla_core.spec import Camera
 from fluxvla_core.testing._conformance import Renamed, is_json, unequal_keys
 
 SEED = 11
@@ -56,7 +56,7 @@ class DivergingPolicy(RandomPolicy):
 
 
 class _SameActions(RandomPolicy):
-    """The same random actions in every episode; it keeps what it has seen."""
+    """The same random actions in every episode; it keeps its observations."""
 
     def reset(self, seed: int) -> None:
         super().reset(SEED)
@@ -128,7 +128,7 @@ class EnvironmentConformance(Renamed):
         return {name: value for name, value in record.items() if name != "timing"}
 
     def course(self, environment: Environment, task: TaskSpec, seed: int) -> str:
-        """What an episode shows, as text; the actions are the same for every ``seed``."""
+        """States, images and rewards of an episode as text; actions do not depend on ``seed``."""
         policy = _SameActions()
         settings = RolloutSettings(cameras=self.cameras(environment), max_steps=self.steps)
         record = run_episode(environment, policy, task, seed, settings)

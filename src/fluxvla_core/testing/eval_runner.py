@@ -5,8 +5,8 @@
     class TestMyEvalRunner(EvalRunnerConformance):
         entry_point = "MyEvalRunner"
 
-pytest collects the inherited tests. They evaluate policies of which is known how well they do: one
-that always succeeds, one that never does, one that does by its seed, and one that fails.
+pytest collects the inherited tests. They evaluate policies with known results: one that always
+succeeds, one that never does, one that does by its seed, and one that raises an error.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ import pytest
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg, parameters
 from fluxvla_core.evaluation.episodes import DONE, POLICY
-from fluxvla_core.plugins.files import load_plugin_files
-from fluxvla_core.plugins.registry import ENVIRONMENTS
+from fluxvla_core.plugins.registry import ENVIRONMENTS, load_plugin_files
 from fluxvla_core.testing._conformance import Conformance, capability, is_json
 
 Outcomes = Mapping[tuple[str, int], bool]
@@ -102,7 +101,7 @@ class EvalRunnerConformance(Conformance):
         return build_runner_from_cfg(section, context)
 
     def evaluate(self, work_dir: Path, policy: Any, **settings: Any) -> Any:
-        """What a whole evaluation gives."""
+        """The result of a whole evaluation."""
         runner = self.build(work_dir, self.section(policy, **settings))
         runner.run_setup()
         return runner.run()

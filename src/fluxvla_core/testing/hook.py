@@ -56,7 +56,7 @@ class HookConformance(Conformance):
         return build_from_cfg({"type": self.entry_point, **self.arguments}, HOOKS, context)
 
     def robot(self) -> list[Call]:
-        """What is called in an episode of a robot."""
+        """The calls in an episode of a robot."""
         return robot(self.joints, self.cameras)
 
     def test_every_method_is_a_hook(self) -> None:
@@ -70,19 +70,19 @@ class HookConformance(Conformance):
 
     def test_a_training_can_be_watched(self, watched: Watched) -> None:
         watched.calls(training(watched.context.work_dir), "ok")
-        assert not watched.problems, watched.told("a training")
+        assert not watched.problems, watched.message("a training")
 
     def test_a_robot_can_be_watched(self, watched: Watched) -> None:
         watched.calls(self.robot(), "ok")
         assert not watched.problems, (
-            watched.told("a robot's run")
+            watched.message("a robot's run")
             + "; the robot has joints and cameras as this kit's subclass sets them"
         )
 
     @pytest.mark.parametrize("outcome", ["failed", "interrupted"])
     def test_a_run_may_end_at_once(self, watched: Watched, outcome: str) -> None:
         watched.calls([], outcome)
-        assert not watched.problems, watched.told(f"a run that {outcome} before its first step")
+        assert not watched.problems, watched.message(f"a run that {outcome} before its first step")
 
     def test_what_it_sees_is_not_its_own(self, watched: Watched) -> None:
         metrics = {"loss": 0.5, "lr": 1e-3}
@@ -114,7 +114,7 @@ class HookConformance(Conformance):
 
 
 class Watched:
-    """A run that a hook watches: what is called, as the core calls it, and what it raised."""
+    """A run that a hook watches: calls it as the core does, and collects its errors."""
 
     def __init__(self, name: str, make: Any, work_dir: Path) -> None:
         work_dir.mkdir(exist_ok=True)
@@ -147,7 +147,7 @@ class Watched:
             self.problems.append(f"{message}; it was given {shapes(arguments)}")
         self.taken.setdefault(name, []).append(time.perf_counter() - start)
 
-    def told(self, what: str) -> str:
+    def message(self, what: str) -> str:
         """The message about its problems while it watched ``what``."""
         return (
             f"watching {what}: {'; '.join(self.problems)}; expected no error: from the first on a "
@@ -156,7 +156,7 @@ class Watched:
 
 
 def training(work_dir: Path) -> list[Call]:
-    """What is called in two steps of a training and at its checkpoint."""
+    """The calls in two steps of a training and at its checkpoint."""
     calls: list[Call] = []
     for step in (1, 2):
         calls.append(("before_step", {"step": step}))
@@ -168,7 +168,7 @@ def training(work_dir: Path) -> list[Call]:
 
 
 def robot(joints: int, cameras: Mapping[str, tuple[int, int]]) -> list[Call]:
-    """What is called in an episode of two chunks on a robot; arrays are read-only."""
+    """The calls in an episode of two chunks on a robot; arrays are read-only."""
     chunk, state = np.zeros((3, joints)), np.zeros(joints, np.float32)
     images = {name: np.zeros((*side, 3), np.uint8) for name, side in cameras.items()}
     arrays: list[np.ndarray[Any, Any]] = [chunk, state, *images.values()]

@@ -25,7 +25,7 @@ import pytest
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.errors import Faulted, FluxError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.testing._conformance import Conformance, equal, is_json
 from fluxvla_core.testing.stand_ins import (
     CLOSE,
@@ -99,7 +99,7 @@ class InferenceRunnerConformance(Conformance):
         return build_runner_from_cfg(self.section(robot, policy, **more), context)
 
     def drive(self, work_dir: Path, robot: Any, policy: Any, **more: Any) -> Any:
-        """What a whole run gives."""
+        """The result of a whole run."""
         runner = self.build(work_dir, robot, policy, **more)
         runner.run_setup()
         return runner.run()

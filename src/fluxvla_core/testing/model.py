@@ -125,7 +125,7 @@ class ModelConformance(Conformance):
         }
 
     def training_batch(self, model: nn.Module, size: int = 2) -> dict[str, Tensor]:
-        """What of ``batch`` the model's ``forward`` takes."""
+        """The keys of ``batch`` that the model's ``forward`` takes."""
         capability(implements(model, VLA, "forward"), "a model to be trained defines forward(...)")
         keys, batch = VLA.adapt(model).batch_keys(), self.batch(model, size)
         if keys is None:
@@ -138,7 +138,7 @@ class ModelConformance(Conformance):
         return {key: value for key, value in batch.items() if key in keys}
 
     def robot_batch(self, model: nn.Module, size: int = 2) -> dict[str, Tensor]:
-        """What of ``batch`` the model's ``predict_action`` takes, without what training has."""
+        """The keys of ``batch`` that the model's ``predict_action`` takes, without actions."""
         own = implements(model, VLA, "predict_action")
         capability(own, "a model that is to act defines predict_action(...)")
         method: Any = model.predict_action

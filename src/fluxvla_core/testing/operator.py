@@ -30,9 +30,8 @@ from fluxvla_core.contracts.check import missing_operator_methods
 from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import NotReady, OperatorError, Rejected
-from fluxvla_core.plugins.files import PLUGIN_FILE
-from fluxvla_core.plugins.registry import OPERATORS
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.plugins.registry import OPERATORS, PLUGIN_FILE
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.testing._operator_parts import STEP, Array, DividedOperatorChecks, not_followed
 
 # An arm is at rest that moves less than this, in its unit, in the time of so many commands.

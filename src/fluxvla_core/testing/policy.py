@@ -23,7 +23,7 @@ from fluxvla_core.contracts.environment import Environment
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor, Continuation, with_history
 from fluxvla_core.errors import FluxError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.testing._conformance import Conformance, calling, capability, equal
 
 Chunk = npt.NDArray[np.float64]
@@ -38,7 +38,7 @@ class PolicyConformance(Conformance):
 
     registry = "policies"
     drives_robots: ClassVar[bool] = True
-    """Whether it says what a robot has to know of it; False for one of simulations alone."""
+    """Whether it has the attributes that robots need; False for a policy of simulations alone."""
     instruction: ClassVar[str] = "pick up the red cup"
     """The instruction of the observations."""
     spec: ClassVar[EmbodimentSpec | None] = None
@@ -107,7 +107,7 @@ class PolicyConformance(Conformance):
         return [np.array(self.asked(policy, one)) for one in seen]
 
     def asked(self, policy: Actor, observation: Observation) -> Any:
-        """What ``predict_action`` answers."""
+        """The result of ``predict_action``."""
         hint = (
             "the state follows from spec, its own embodiment by default, and the images are those "
             "of its cameras; set these, or override observation(policy, number) in this kit's "

@@ -2,9 +2,9 @@
 
     python -m fluxvla_core.testing.ros2_driver '{"streams": […], "sinks": […]}'
 
-``Driver`` starts that process from a test, gives it orders and keeps what it received. It is a
-process of its own because drivers are: lost images, killed publishers and other settings after a
-restart happen between processes only.
+``Driver`` starts that process from a test, gives it orders and keeps the messages that it received.
+It is a process of its own because drivers are: lost images, killed publishers and other settings
+after a restart happen between processes only.
 Set ``ROS_DOMAIN_ID`` and ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` before starting one.
 """
 
@@ -32,13 +32,13 @@ class Driver:
     """The process, from outside; a context manager.
 
     Args:
-        streams: what it publishes. Each has ``topic``, ``message`` (type), ``hz``, and, by type:
-            ``names`` and ``positions`` (JointState), ``height``, ``width`` and ``encoding``
+        streams: topics that it publishes. Each has ``topic``, ``message`` (type), ``hz``, and by
+            type: ``names`` and ``positions`` (JointState), ``height``, ``width`` and ``encoding``
             (Image), ``format`` (CompressedImage: ``jpeg`` or ``png``), ``data`` (std_msgs),
             ``follows`` (a sink's topic: the last command there is where its joints are, in the
             order of ``command_names`` if it has none);
             ``best_effort`` and ``latched`` set its QoS; ``stamped: false`` leaves stamps at zero.
-        sinks: what it listens to: ``topic`` and ``message``. What arrives is in ``heard``.
+        sinks: topics that it subscribes to: ``topic`` and ``message``. Messages are in ``heard``.
         name: of its node.
         environment: of the process; this one's by default.
     """
@@ -164,7 +164,7 @@ def _targets(command: Any, names: Sequence[str]) -> dict[str, float]:
 
 
 def camera_pattern(height: int, width: int, encoding: str) -> np.ndarray[Any, np.dtype[Any]]:
-    """What the driver's cameras see: in colours, red 10, green 20, blue 30; in depth, 1.5 m."""
+    """The images of the driver's cameras: red 10, green 20, blue 30; depth 1.5 m."""
     if encoding == "16UC1":
         return np.full((height, width), 1500, np.uint16)
     if encoding == "32FC1":
@@ -251,7 +251,7 @@ def _order(order: Mapping[str, Any], faults: Faults, publishers: Sequence[_Publi
 
 
 def run(spec: Mapping[str, Any]) -> None:
-    """Be the driver until standard input ends."""
+    """Run the driver until standard input ends."""
     connection = Connection(spec.get("name", "driver"))
     lock = threading.Lock()
 

@@ -14,7 +14,7 @@ from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.control.clock import SimulatedClock
 from fluxvla_core.errors import NotReady
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 Array = npt.NDArray[np.float64]
 Fault = Callable[[], object]
@@ -53,17 +53,17 @@ def near(spec: EmbodimentSpec, place: Array, seconds: float) -> Array:
 
 
 class StandInRobot(Operator):
-    """Follows each command at once, in a time of its own; keeps what happened to it.
+    """A robot in memory that follows each command at once, in simulated time, and logs its calls.
 
     A stand-in for an operator of another shape is a subclass whose own methods call ``receive``.
 
     Args:
-        spec: what it is.
+        spec: its embodiment.
 
     Attributes:
         state: ``(dim,)`` where it is.
         sent: the ``(dim,)`` commands.
-        events: what happened, in order: ``connect``, ``command``, ``stop``, ``close``.
+        events: the calls, in order: ``connect``, ``command``, ``stop``, ``close``.
         on_frame, on_command: called before a reading and before a command; may raise.
     """
 
@@ -100,7 +100,7 @@ class StandInRobot(Operator):
         return self.image(camera)
 
     def receive(self, action: Array) -> None:
-        """Take a ``(dim,)`` command, whatever it is: the kit says what is wrong with it."""
+        """Take a ``(dim,)`` command without checking it; the kit does."""
         self.on_command()
         self.events.append(COMMAND)
         self.sent.append(np.array(action, dtype=np.float64))

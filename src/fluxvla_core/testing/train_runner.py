@@ -7,7 +7,7 @@
         ranks = 2
 
 pytest collects the inherited tests. They start real processes on the loopback, kill some of them,
-and compare what is left bit for bit.
+and compare the resulting files bit for bit.
 """
 
 from __future__ import annotations
@@ -137,8 +137,8 @@ class TrainRunnerConformance(Conformance):
     def test_one_rank_that_is_told_to_stop_stops_all_with_all_saved(self, tmp_path: Path) -> None:
         config = self.config(max_steps=9)
         whole, cut = ({"config": config, "work_dir": str(tmp_path / name)} for name in "ab")
-        told = {"signal": (self.ranks - 1, 4, signal.SIGTERM), "notice_s": 0.0}
-        codes = self.start(whole, {**cut, **told})
+        signalled = {"signal": (self.ranks - 1, 4, signal.SIGTERM), "notice_s": 0.0}
+        codes = self.start(whole, {**cut, **signalled})
         assert codes == [1] * self.ranks, (
             f"one rank had SIGTERM, and the processes ended with {codes}, expected "
             f"{[1] * self.ranks}: all of them stop at the same step, with everything saved"
@@ -259,7 +259,7 @@ class TrainRunnerConformance(Conformance):
 
 
 def refusal(settings: Mapping[str, Any]) -> None:
-    """One run that is refused for its config; writes what it says to ``refused.txt``.
+    """One run that is refused for its config; writes the message to ``refused.txt``.
 
     Raises:
         AssertionError: it trains.
@@ -302,7 +302,7 @@ def _ended(what: str, codes: Sequence[int | None]) -> str:
 
 
 def _differ(names: Sequence[str], how: str) -> str:
-    """What it means that a run that was interrupted leaves other files."""
+    """The message for an interrupted run that left other files."""
     return (
         f"a run that was {how} left other bytes in {', '.join(names[:6])} than one that was not, "
         "expected the same: what the strategy keeps from one step to the next is not all in the "

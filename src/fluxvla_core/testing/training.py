@@ -1,4 +1,4 @@
-"""A model, a dataset and a launcher small enough to prove a training strategy with.
+"""A small model, dataset and launcher for tests of training strategies.
 
 ``testing.train_runner`` has the proofs; FluxVLA's own runners are tested with them.
 """
@@ -26,12 +26,12 @@ from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import ENVIRONMENT, folders
 from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
 from fluxvla_core.checkpoints.writer import Disk
-from fluxvla_core.contracts.reporter import SilentReporter
+from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.sampler import sample_rng
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 from fluxvla_core.training import stop
 from fluxvla_core.training.base_runner import BaseTrainRunner
 from fluxvla_core.training.metrics import WALL_CLOCK
@@ -218,7 +218,7 @@ def tiny_config(
 
 
 class Notes(SilentReporter):
-    """Writes what a run says to people into ``said.txt`` of its work dir."""
+    """Writes the messages of a run into ``said.txt`` of its work dir."""
 
     def __init__(self, work_dir: Path) -> None:
         self.path = work_dir / "said.txt"
@@ -432,8 +432,8 @@ def differences(left: Path, right: Path) -> list[str]:
 def checkpoint_differences(left: Path, right: Path) -> list[str]:
     """Names of files that differ between two checkpoints' folders.
 
-    Not compared are ``environment.json``, for what is installed may change between two runs, and
-    the manifest, which follows from the rest.
+    Not compared are ``environment.json``, as packages may change between two runs, and the
+    manifest, which follows from the rest.
     """
     skipped = {Path(MANIFEST), Path(ENVIRONMENT)}
     files = {p.relative_to(d) for d in (left, right) for p in d.rglob("*") if p.is_file()}

@@ -31,7 +31,7 @@ from fluxvla_core.testing._conformance import (
 )
 
 SEED = 5
-# What a robot's observation does not have.
+# Keys that a robot's observation does not have.
 _LEARNT_FROM = ("actions", "action_masks", "timestamp", "sample_ids", "info")
 _CLOSE = 1e-4
 
@@ -84,7 +84,7 @@ class TransformConformance(Conformance):
         }
 
     def observation(self, number: int = 0) -> Sample:
-        """What a robot has of ``sample``."""
+        """The keys of ``sample`` that a robot has."""
         return {k: v for k, v in self.sample(number).items() if k not in _LEARNT_FROM}
 
     def apply(self, transform: Any, sample: Sample, seed: int = SEED) -> Sample:

@@ -37,34 +37,5 @@ if TYPE_CHECKING:
     from fluxvla_core.training.weights import left_out as left_out
 
 __getattr__, __dir__, __all__ = _lazy.attach(
-    __name__,
-    {
-        "fluxvla_core.checkpoints.shards": ["Stored"],
-        "fluxvla_core.contracts.runner": ["TrainRunner"],
-        "fluxvla_core.contracts.training": [
-            "Collator",
-            "Dataset",
-            "Metric",
-            "Optimizer",
-            "RandomTransform",
-            "Tokenizer",
-            "Transform",
-            "VLA",
-        ],
-        "fluxvla_core.training.base_runner": ["BaseTrainRunner"],
-        "fluxvla_core.training.distributed": ["World", "broadcast_buffers"],
-        "fluxvla_core.training.model": ["units_of"],
-        "fluxvla_core.training.parameters": [
-            "Layout",
-            "bare",
-            "decay_groups",
-            "nbytes",
-            "refuse_scalars",
-            "replicated_layout",
-            "trainable",
-        ],
-        "fluxvla_core.training.rng": ["rng_state", "set_rng_state"],
-        "fluxvla_core.training.weights": ["left_out"],
-    },
-    deprecated={"share_buffers": "broadcast_buffers", "whole": "replicated_layout"},
+    __name__, {"share_buffers": "broadcast_buffers", "whole": "replicated_layout"}
 )

@@ -29,8 +29,7 @@ from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.checkpoints.shards import Stored
 from fluxvla_core.checkpoints.tensors import TensorFile, check_names
 from fluxvla_core.checkpoints.writer import PARTIAL, CheckpointWriter
-from fluxvla_core.config.load import FORMAT
-from fluxvla_core.config.snapshot import environment
+from fluxvla_core.config.load import FORMAT, environment
 from fluxvla_core.contracts.checkpoint_format import CheckpointFormat, ForeignCheckpoint
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA, Transform
@@ -41,7 +40,7 @@ from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.data.preparation import check_statistics, try_preparation
 from fluxvla_core.data.transforms.pipeline import Pipeline, redirected
 from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, UsageError, located
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training.formats import formats, read_foreign, unknown_format
 from fluxvla_core.training.lora import CONFIG as ADAPTER
 from fluxvla_core.training.weights import (

@@ -23,7 +23,7 @@ from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.example import Example, Refused, example
 from fluxvla_core.errors import ConfigError, FluxError
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
 from fluxvla_core.training.footprint import (

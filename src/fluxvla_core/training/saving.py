@@ -22,8 +22,7 @@ from fluxvla_core.checkpoints.retention import rotate
 from fluxvla_core.checkpoints.shards import is_sharded, local_shards
 from fluxvla_core.checkpoints.tensors import TensorFile
 from fluxvla_core.checkpoints.writer import CheckpointWriter, json_bytes
-from fluxvla_core.config.load import FORMAT
-from fluxvla_core.config.snapshot import environment
+from fluxvla_core.config.load import FORMAT, environment
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.training import lora
 from fluxvla_core.training.distributed import World, all_gather_text, all_reduce_max, run_on_rank0

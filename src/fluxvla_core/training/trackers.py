@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from fluxvla_core import atomic
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import ConfigError, nearest
 
 Records = Sequence[tuple[int, Mapping[str, float]]]

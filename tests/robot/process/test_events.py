@@ -27,8 +27,7 @@ from fluxvla_core.robot.events import (
     Stopped,
     StoppedWhileHeld,
 )
-from fluxvla_core.robot.process.event_messages import event_message, event_of
-from fluxvla_core.robot.process.messages import Message, decode, encode
+from fluxvla_core.robot.process.messages import Message, decode, encode, event_message, event_of
 from fluxvla_core.robot.tasks import Task
 
 POSE = np.array([0.1, -np.pi, 1e-300])

@@ -14,7 +14,7 @@ from fluxvla_core.errors import SafetyStop
 from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS
 from fluxvla_core.robot.process.timed_filters import MOST_LATE
 from fluxvla_core.robot.runner import BaseInferenceRunner
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 pytestmark = pytest.mark.realtime
 
@@ -25,7 +25,7 @@ import numpy as np
 
 from fluxvla_core.contracts.frame import Frame
 from fluxvla_core.contracts.robot import ActionFilter, Operator
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 
 class FileArm(Operator):

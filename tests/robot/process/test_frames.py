@@ -23,7 +23,7 @@ from fluxvla_core.robot.process.frames import (
     message_of_frame,
 )
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 CAMERAS = (Camera("front", 48, 64), Camera("wrist", 30, 40))
 SPEC = EmbodimentSpec("arm", (Joint("j", "rad", -1, 1, 2, 10),), CAMERAS, 50)

@@ -11,7 +11,7 @@ from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.runner import BaseInferenceRunner
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 
 class Refusing(Operator):

@@ -17,11 +17,15 @@ from fluxvla_core.commands import SilentReporter
 from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.control.filters import LowPass, SnapGripper
 from fluxvla_core.control.safety import SafetySettings
-from fluxvla_core.plugins.files import forget_plugin_files, load_plugin_files
-from fluxvla_core.plugins.registry import ACTION_FILTERS, OPERATORS
+from fluxvla_core.plugins.registry import (
+    ACTION_FILTERS,
+    OPERATORS,
+    forget_plugin_files,
+    load_plugin_files,
+)
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.process.setup import ControlSetup, import_path, registered_here
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec(
     "arm",

@@ -21,7 +21,7 @@ from fluxvla_core.robot.process.timed_filters import (
     TimedFilter,
     timed_filters,
 )
-from fluxvla_core.spec.embodiment import EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 
 SPEC = EmbodimentSpec(
     "arm",

@@ -12,6 +12,7 @@ import pytest
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.errors import FluxError, NotReady, SafetyStop
+from fluxvla_core.robot.process import control_process
 from fluxvla_core.robot.recording.recorded import find_recordings, open_recording
 from fluxvla_core.robot.runner import BaseInferenceRunner
 
@@ -194,6 +195,22 @@ def test_after_a_rearm_a_new_control_process_shows_its_frames(tmp_path, module):
     assert run.runner.run()["outcome"] == "max_steps"
     assert len(run.policy.seen) > 5
     assert len(set(run.log("connected")[:, 0])) == 3
+
+
+def test_ctrl_c_while_the_control_process_is_started_leaves_none(tmp_path, module, monkeypatch):
+    run, started, launch = Run(tmp_path), [], control_process.launch
+
+    def launch_and_interrupt(*arguments):
+        process, link = launch(*arguments)
+        started.append(process)
+        os.kill(os.getpid(), signal.SIGINT)
+        return process, link
+
+    monkeypatch.setattr(control_process, "launch", launch_and_interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run.runner.run()
+    assert [process.poll() is None for process in started] == [False]
+    assert not (tmp_path / "sent").exists()
 
 
 def test_a_robot_whose_first_frame_never_comes(tmp_path, module):

@@ -13,7 +13,7 @@ import pytest
 from fluxvla_core.build import RunContext
 from fluxvla_core.plugins.registry import OPERATORS, RUNNERS
 from fluxvla_core.robot.runner import BaseInferenceRunner
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 MODULE = '''
 import json
@@ -27,7 +27,7 @@ from fluxvla_core.contracts.frame import Frame, RobotFrame
 from fluxvla_core.contracts.robot import Operator
 from fluxvla_core.errors import NotReady
 from fluxvla_core.robot.runner import BaseInferenceRunner
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 
 class OldArm(Operator):

@@ -20,7 +20,7 @@ from fluxvla_core.robot.recording.recorded import (
     read_lines,
 )
 from fluxvla_core.robot.recording.trace import EpisodeTrace, JsonLines, Recording
-from fluxvla_core.spec.embodiment import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 pytest.importorskip("rosbags")
 

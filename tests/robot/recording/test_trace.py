@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -110,14 +111,30 @@ def test_timings_are_percentiles_in_milliseconds():
     for n in range(1, 101):
         timings.add("send", n / 1000)
     timings.add("policy", 0.5)
+    timings.add("sync", 0.0)
 
     report = timings.summary()
-    assert list(report) == ["send", "policy"]
+    assert list(report) == ["send", "policy", "sync"]
     assert report["send"] == {
         "count": 100,
-        "p50_ms": 50.5,
-        "p95_ms": 95.05,
-        "p99_ms": 99.01,
+        "p50_ms": pytest.approx(50, rel=0.003),
+        "p95_ms": pytest.approx(95, rel=0.003),
+        "p99_ms": pytest.approx(99, rel=0.003),
         "max_ms": 100.0,
     }
+    assert report["policy"]["p99_ms"] == pytest.approx(500, rel=0.003)
+    assert set(report["sync"].values()) == {1, 0.0}
     assert Timings().summary() == {}
+
+
+def test_timings_of_a_long_episode_take_no_more_memory():
+    timings = Timings()
+    durations = np.random.default_rng(0).lognormal(-4.0, 0.2, 100_000).tolist()
+    tracemalloc.start()
+    for seconds in durations:
+        timings.add("send", seconds)
+    taken, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # As floats they would take 800 kB.
+    assert taken < 100_000
+    assert timings.summary()["send"]["count"] == 100_000

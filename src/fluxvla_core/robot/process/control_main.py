@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -20,14 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control import realtime
-from fluxvla_core.control.interrupt import Interrupted
+from fluxvla_core.control.interrupt import Interrupted, what_became
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.control.safety import Latch
 from fluxvla_core.control.sender import ExecuteActions
 from fluxvla_core.control.tracking import TrackingWatch
-from fluxvla_core.errors import FluxError
+from fluxvla_core.errors import EXIT_FAILED, FluxError
 from fluxvla_core.robot.engine import Engine, LocalEngine, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts
 from fluxvla_core.robot.events import (
@@ -39,17 +41,16 @@ from fluxvla_core.robot.events import (
     Phase,
     Stopped,
 )
-from fluxvla_core.robot.process.event_messages import event_message
 from fluxvla_core.robot.process.frames import FrameChannel
 from fluxvla_core.robot.process.inbox import Inbox
 from fluxvla_core.robot.process.link import Link
-from fluxvla_core.robot.process.messages import Kind, Message, error_fields
+from fluxvla_core.robot.process.messages import Kind, Message, error_fields, event_message
 from fluxvla_core.robot.process.remote_policy_client import RemotePolicyClient
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.process.timed_filters import timed_filters
 from fluxvla_core.robot.process.undivided_robot import UndividedRobot
 from fluxvla_core.robot.recording.logged import logged
-from fluxvla_core.robot.robot import Robot
+from fluxvla_core.robot.robot import STOP_S, Robot
 from fluxvla_core.robot.tasks import Task
 
 # How often an idle process looks for orders, and a wait for an answer.
@@ -60,6 +61,9 @@ _NO_REAL_TIME = (
 )
 # Commands between two collections of young objects, which take place right after a command.
 _COMMANDS_PER_COLLECTION = 64
+# How long after the main process's death a call of the operator may hang: nobody else is there who
+# would kill this process. A stop takes less.
+_ORPHANED_S = 6 * STOP_S
 # Events of half a minute: more than the main process can lose.
 _EVENTS_KEPT = 4096
 _IGNORED = ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGPIPE")
@@ -143,8 +147,9 @@ def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = 
         ConfigError, PluginError: the operator or a filter cannot be built.
     """
     reporter = LinkReporter(link)
-    inbox = Inbox(link, setup.settings.safety)
+    inbox = Inbox(link, setup.settings.safety, setup.main)
     _take_signals(inbox)
+    threading.Thread(target=_outlive_main, args=(inbox,), daemon=True).start()
     logging.getLogger().addHandler(LinkLog(link))
     robot, execute_actions = setup.build_control_side(reporter)
     if isinstance(robot, UndividedRobot):
@@ -179,14 +184,21 @@ def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = 
             _report_orphaned(engine, failures)
 
 
+def _outlive_main(inbox: Inbox) -> None:
+    """Let this process stop the robot after the main process's death, and no longer."""
+    while not inbox.orphaned:
+        time.sleep(1.0)
+    time.sleep(_ORPHANED_S)
+    os._exit(EXIT_FAILED)
+
+
 def _report_orphaned(engine: Engine, failures: Sequence[str | None]) -> None:
     """Print what became of the robot: there is no other process that could."""
-    trouble = "; ".join(text for text in (engine.stop_failure, *failures) if text)
+    # A stop that failed at the episode's end fails again.
+    trouble = "; ".join(dict.fromkeys(text for text in (engine.stop_failure, *failures) if text))
     with suppress(OSError):  # The terminal may be gone, too.
         print(
-            "fluxvla: the main process was killed; the robot was stopped"
-            + (f": {trouble}" if trouble else ""),
-            file=sys.stderr,
+            f"fluxvla: the main process was killed; {what_became(trouble or None)}", file=sys.stderr
         )
 
 

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import os
 import queue
-import signal
 import subprocess
 import sys
 import threading
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.interrupt import Interrupts
 from fluxvla_core.control.safety import Rule
 from fluxvla_core.errors import RunFailed, SafetyStop
@@ -24,6 +23,7 @@ from fluxvla_core.robot.process.query_server import LinkServer
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot
+from fluxvla_core.signals import signal_name
 
 # Without the folder that it is started in: modules are found where this process finds them.
 _COMMAND = (sys.executable, *(("-P",) if sys.version_info >= (3, 11) else ()), "-m", __package__)
@@ -123,7 +123,7 @@ class ControlProcess:
         code = self._process.poll()
         if code is not None and self.server.messages.empty():
             ended = f"ended with exit code {code}"
-            raise self._gone(ended if code >= 0 else f"was killed by {signal.Signals(-code).name}")
+            raise self._gone(ended if code >= 0 else f"was killed by {signal_name(-code)}")
         if code is None and not self.server.alive:
             self.link.send(Kind.CLOSE)
             try:

@@ -23,7 +23,8 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import STATE, Frame, RobotFrame
 from fluxvla_core.control.safety import BadFrame
 from fluxvla_core.robot.operator_values import is_number
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.robot.process.link import allocate
+from fluxvla_core.spec import EmbodimentSpec
 
 AnyArray = npt.NDArray[Any]
 _ASKED, _ANSWERED, _LENGTH = 0, 1, 2
@@ -59,14 +60,9 @@ def make_frame_memory(size: int) -> FrameMemory:
     """Memory for frames of ``size`` bytes; it is gone with the processes that have it.
 
     Raises:
-        OSError: there is not so much memory. Pages that are missing later would crash a process.
+        OSError: there is not so much memory.
     """
-    memory = os.memfd_create("fluxvla-frames")
-    try:
-        os.posix_fallocate(memory, 0, size)
-    except OSError:
-        os.close(memory)
-        raise
+    memory = allocate("fluxvla-frames", size)
     return FrameMemory(memory, os.eventfd(0, os.EFD_CLOEXEC), os.eventfd(0, os.EFD_CLOEXEC))
 
 

@@ -42,11 +42,12 @@ class Inbox(Interrupts):
     Args:
         link: the control process's end.
         safety: how long the main process may be silent.
+        main: the main process's id. This process may have another parent already.
 
     ``watch`` is called at every tick while the arm moves, and raises what is to stop it.
     """
 
-    def __init__(self, link: Link, safety: SafetySettings) -> None:
+    def __init__(self, link: Link, safety: SafetySettings, main: int) -> None:
         super().__init__()
         self.phase = Phase.OVER
         self.orders: deque[Message] = deque()
@@ -54,7 +55,7 @@ class Inbox(Interrupts):
         self.replies: dict[str, Message] = {}
         self._link = link
         self._safety = safety
-        self._main = os.getppid()
+        self._main = main
         self._fault: FluxError | None = None
         self.watch: Callable[[], None] = lambda: None
 

@@ -26,14 +26,19 @@ SIZE = _TIMES + TO_CONTROL_BYTES + TO_MAIN_BYTES
 
 
 def make_memory() -> int:
-    """A file descriptor of memory for both ends; it is gone with the processes that have it.
+    """Memory for both ends, as ``allocate``; it is gone with the processes that have it."""
+    return allocate("fluxvla-robot", SIZE)
+
+
+def allocate(name: str, size: int) -> int:
+    """A file descriptor of ``size`` bytes of memory without a file; ``name`` is for people.
 
     Raises:
         OSError: there is not so much memory. Pages that are missing later would crash a process.
     """
-    descriptor = os.memfd_create("fluxvla-robot")
+    descriptor = os.memfd_create(name)
     try:
-        os.posix_fallocate(descriptor, 0, SIZE)
+        os.posix_fallocate(descriptor, 0, size)
     except OSError:
         os.close(descriptor)
         raise

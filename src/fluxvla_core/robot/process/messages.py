@@ -1,5 +1,7 @@
 """Messages between the two processes of a robot: a kind, JSON values, and arrays of float64.
 
+Errors and an episode's events are sent as such.
+
 Nothing is pickled: a message can make numbers and text, no objects.
 """
 
@@ -8,7 +10,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -17,7 +19,19 @@ import numpy.typing as npt
 
 from fluxvla_core import errors
 from fluxvla_core.control import policy_client, safety
+from fluxvla_core.control.limits import Clamp
+from fluxvla_core.control.safety import Trip
+from fluxvla_core.control.sender import SentCommand
 from fluxvla_core.errors import FluxError, RunFailed
+from fluxvla_core.robot.events import (
+    CommandSent,
+    EpisodeEnded,
+    Event,
+    FilterLeftOut,
+    Phase,
+    Stopped,
+    StoppedWhileHeld,
+)
 
 Array = npt.NDArray[np.float64]
 _HEADER = struct.Struct("<I")
@@ -92,7 +106,7 @@ class Kind(str, Enum):
     LOG = "log"
     """A record of ``logging``: ``logger``, ``level``, ``text``."""
 
-    # Control process -> main process: events of the episode, see ``event_messages``.
+    # Control process -> main process: events of the episode, see ``event_message``.
     COMMAND = "command"
     FILTER_LEFT_OUT = "filter left out"
     STOPPED = "stopped"
@@ -167,3 +181,57 @@ def _classes(*modules: Any) -> dict[str, type[FluxError]]:
 
 
 _KNOWN = _classes(errors, safety, policy_client)
+
+
+def event_message(event: Event) -> Message | None:
+    """``event`` as a message; None for one that the main process emits itself."""
+    match event:
+        case CommandSent(at, sent, phase, state, send_s, late_s):
+            fields = {
+                "at": at,
+                "phase": phase.value,
+                "held": sent.held,
+                "clamps": [asdict(clamp) for clamp in sent.clamps],
+                "send_s": send_s,
+                "late_s": late_s,
+            }
+            arrays = (sent.target, sent.command)
+            return Message(Kind.COMMAND, fields, arrays if state is None else (*arrays, state))
+        case FilterLeftOut():
+            return Message(Kind.FILTER_LEFT_OUT, vars(event))
+        case Stopped():
+            return Message(Kind.STOPPED, vars(event))
+        case StoppedWhileHeld(at, trip, failure):
+            held = {"at": at, "trip": asdict(trip), "failure": failure}
+            return Message(Kind.STOPPED_WHILE_HELD, held)
+        case EpisodeEnded():
+            return Message(Kind.ENDED, {**vars(event), "trips": [asdict(t) for t in event.trips]})
+    return None
+
+
+def event_of(message: Message) -> Event | None:
+    """The event of ``event_message``; None for a message of another kind."""
+    fields = dict(message.fields)
+    match message.kind:
+        case Kind.COMMAND:
+            target, command, *state = message.arrays
+            clamps = tuple(Clamp(**clamp) for clamp in fields["clamps"])
+            sent = SentCommand(target, command, clamps, fields["held"])
+            return CommandSent(
+                fields["at"],
+                sent,
+                Phase(fields["phase"]),
+                state[0] if state else None,
+                fields["send_s"],
+                fields["late_s"],
+            )
+        case Kind.FILTER_LEFT_OUT:
+            return FilterLeftOut(**fields)
+        case Kind.STOPPED:
+            return Stopped(**fields)
+        case Kind.STOPPED_WHILE_HELD:
+            return StoppedWhileHeld(fields["at"], Trip(**fields["trip"]), fields["failure"])
+        case Kind.ENDED:
+            trips = tuple(Trip(**trip) for trip in fields.pop("trips"))
+            return EpisodeEnded(trips=trips, **fields)
+    return None

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control import realtime
 from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.control.policy_client import PolicyClient
@@ -36,8 +36,7 @@ from fluxvla_core.robot.process.control_process import (
     ControlProcessGone,
     stop_through_new_connection,
 )
-from fluxvla_core.robot.process.event_messages import event_of
-from fluxvla_core.robot.process.messages import Kind, Message, error_fields, error_of
+from fluxvla_core.robot.process.messages import Kind, Message, error_fields, error_of, event_of
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot
@@ -163,9 +162,15 @@ class RemoteEngine(Engine):
             FluxError: its side of the robot cannot be built, or cannot be connected to; or this
                 machine has no room for it.
         """
-        self._started = ControlProcess(
-            self._setup, self._robot, self._interrupts, self._remote_operator
-        )
+        interrupts = self._interrupts
+        # Ctrl-C waits until the process is known here, and can be ended.
+        deferred, interrupts.deferred = interrupts.deferred, True
+        try:
+            self._started = ControlProcess(
+                self._setup, self._robot, interrupts, self._remote_operator
+            )
+        finally:
+            interrupts.deferred = deferred
         try:
             self._await(Kind.READY, _START_S)
             self._order(Kind.CONNECT, None)

@@ -19,7 +19,7 @@ from fluxvla_core.robot.process.frames import (
     observation_of,
 )
 from fluxvla_core.robot.process.messages import error_of
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 # How often a wait for a frame sees whether there is still somebody who could send one.
 _POLL_S = 0.05

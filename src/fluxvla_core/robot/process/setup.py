@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,17 +20,23 @@ from fluxvla_core.build import (
     build_operator_from_cfg,
     build_runner_from_cfg,
 )
-from fluxvla_core.contracts.reporter import Reporter
 from fluxvla_core.contracts.robot import ActionFilter, Operator
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.safety import SafetySettings
 from fluxvla_core.control.sender import ExecuteActions
-from fluxvla_core.plugins.files import load_plugin_files, plugin_files
-from fluxvla_core.plugins.registry import ACTION_FILTERS, BY_NAME, OPERATORS, RUNNERS
+from fluxvla_core.plugins.registry import (
+    ACTION_FILTERS,
+    BY_NAME,
+    OPERATORS,
+    RUNNERS,
+    load_plugin_files,
+    plugin_files,
+)
 from fluxvla_core.robot.episode import EpisodeSettings
 from fluxvla_core.robot.options import build_filters
 from fluxvla_core.robot.process.undivided_robot import UndividedRobot
 from fluxvla_core.robot.robot import Robot
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,7 @@ class ControlSetup:
             that the main process is shown. None where it is divided.
         runner: table of a runner that sends commands, or makes observations, by methods of its own:
             it is built here too, without a policy. None where there is none.
+        main: the main process's id.
     """
 
     config: Mapping[str, Any]
@@ -72,6 +80,7 @@ class ControlSetup:
     plugin_files: Sequence[str] = field(default_factory=plugin_files)
     cameras: Sequence[str] | None = None
     runner: Mapping[str, Any] | None = None
+    main: int = field(default_factory=os.getpid)
 
     def to_json(self) -> str:
         """As JSON.

@@ -22,7 +22,7 @@ from fluxvla_core.control import realtime
 from fluxvla_core.control.filters import LowPass, SnapGripper, WorkspaceBox
 from fluxvla_core.control.safety import BadCommand, FilterLate
 from fluxvla_core.robot.process.messages import Array
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 SHARE = 0.5
 """Share of the control period that all timed filters together may take: no command is later than

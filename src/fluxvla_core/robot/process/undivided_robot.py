@@ -22,7 +22,7 @@ from fluxvla_core.robot.process.frames import (
 )
 from fluxvla_core.robot.process.messages import error_fields
 from fluxvla_core.robot.robot import Observe, Robot, StateSample
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 
 class UndividedRobot(Robot):

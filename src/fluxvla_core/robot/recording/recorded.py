@@ -26,7 +26,7 @@ from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording import ros_messages as ros
 from fluxvla_core.robot.recording.bag import McapFile, bag_writer
 from fluxvla_core.robot.recording.trace import EVENTS_FILE, REST_FILE, SUMMARY_FILE
-from fluxvla_core.spec.embodiment import EmbodimentSpec, check_match
+from fluxvla_core.spec import EmbodimentSpec, check_match
 from fluxvla_core.untrusted import read_bytes
 
 Array = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 
 from fluxvla_core.contracts.frame import STATE
 from fluxvla_core.contracts.policy import Policy
-from fluxvla_core.contracts.reporter import Reporter
+from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.robot.events import (
     ChunkAccepted,

@@ -30,7 +30,7 @@ from fluxvla_core.robot.recording.recorded import (
 )
 from fluxvla_core.robot.recording.ros_messages import BASE
 from fluxvla_core.ros2 import RobotFrame, checked_action, depth_stream
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 CHUNKS, COMMANDS = "chunks", "commands"

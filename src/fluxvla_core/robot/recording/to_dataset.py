@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from fluxvla_core.contracts.reporter import Reporter, SilentReporter
+from fluxvla_core.contracts.runner import Reporter, SilentReporter
 from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import DataError
 from fluxvla_core.robot.recording.recorded import (
@@ -25,7 +25,7 @@ from fluxvla_core.robot.recording.recorded import (
     newest_at,
     open_recording,
 )
-from fluxvla_core.spec.embodiment import EmbodimentSpec
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 

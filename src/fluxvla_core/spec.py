@@ -1,4 +1,4 @@
-"""Embodiment specs: joints, units, limits, cameras; shared by dataset, policy and robot.
+"""Embodiment specs: joints, units, limits and cameras of a robot, for dataset, policy and robot.
 
 Pure data without numpy or torch, so that a config check, a robot's onboard computer and a server
 hello can read it without anything installed. Lengths are metres, angles radians, times seconds.
@@ -178,7 +178,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class EmbodimentSpec:
-    """A robot as a policy sees it: ``dim`` numbers in, ``dim`` numbers out, some images.
+    """A robot as a policy sees it: names, units and limits of its joints, cameras, rate.
 
     Args:
         name: for people, for example ``aloha``.

@@ -7,8 +7,7 @@ import pytest
 
 from fluxvla_core import Camera, EmbodimentSpec, Joint
 from fluxvla_core.errors import SpecMismatch
-from fluxvla_core.spec import check_match
-from fluxvla_core.spec.embodiment import speeds
+from fluxvla_core.spec import check_match, speeds
 
 ELBOW = Joint("elbow", "rad", -1.5, 1.5, 2.0, 8.0)
 GRIPPER = Joint("gripper", "normalized", 0.0, 1.0, 4.0, 40.0, "gripper", open=1.0, closed=0.0)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.envs import Env
-from tools.joined_env import join
+from tools.envs import Env, join
 
 PYTHON = f"python{sys.version_info[0]}.{sys.version_info[1]}"
 

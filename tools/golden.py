@@ -9,7 +9,8 @@ A program ``plugins/fluxvla-NAME/tests/oracles/make_REFERENCE.py``
   as ``python PROGRAM [FOLDER]``; FOLDER is ``plugins/fluxvla-NAME/tests/golden`` if it is left out;
 - writes ``FOLDER/**/*.safetensors`` with the versions of what it compares with in the metadata;
 - takes weights and inputs from ``tests.oracles.fill``, and nothing from a clock or an unseeded
-  generator, so that it writes the same again.
+  generator, so that it writes the same again; names of what is computed in bfloat16 begin with
+  ``bf16.``.
 
 Every file in a ``tests/golden`` is written by one of the programs beside it.
 
@@ -31,6 +32,8 @@ from tools import project
 
 TOLERANCE = 1e-5
 """Of a tensor's largest magnitude: processors differ in the order of sums."""
+NARROW, NARROW_TOLERANCE = "bf16.", 5e-2
+"""Names of what was computed in bfloat16 begin so, and are compared with this."""
 _ENVIRONMENT = re.compile(r"^ENVIRONMENT = \"(\w+)\"$", re.MULTILINE)
 
 
@@ -85,7 +88,8 @@ def compared(made: Mapping[str, Any], committed: Mapping[str, Any]) -> list[str]
             continue
         apart = float(abs(ours.astype("float64") - theirs.astype("float64")).max(initial=0.0))
         largest = float(abs(theirs.astype("float64")).max(initial=0.0))
-        bound = TOLERANCE * largest if theirs.dtype.kind == "f" else 0.0
+        share = NARROW_TOLERANCE if name.startswith(NARROW) else TOLERANCE
+        bound = share * largest if theirs.dtype.kind == "f" else 0.0
         if not apart <= bound:
             lines.append(f"{name}: {apart:.3g} apart, at most {bound:.3g} expected")
     return lines

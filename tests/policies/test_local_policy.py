@@ -239,6 +239,9 @@ def test_images_with_more_pixels_are_scaled_before_pixels_are_cut_by_number(tmp_
     large["images"]["front"] = np.zeros((0, 128, 3), np.uint8)
     with pytest.raises(DataError, match=r"gives uint8 of shape \(0, 128, 3\)"):
         policy.predict_action(large)
+    large["images"]["front"] = np.zeros((96, 96, 3), np.uint8)
+    with pytest.raises(DataError, match=r"'front' gives 96 x 96 images; .* on 24 x 32: another vi"):
+        policy.predict_action(large)
 
 
 def test_bf16_computes_and_still_gives_float64(tmp_path):

@@ -41,11 +41,14 @@ def test_a_program_without_an_environment(tmp_path: Path) -> None:
         ({"x": np.array([1.0, np.nan], np.float32)}, "x: nan apart"),
         ({"x": np.array([1.0], np.float32)}, r"x: float32 \(1,\), committed float32 \(2,\)"),
         ({"n": np.array([4])}, "n: 1 apart, at most 0"),
+        ({"bf16.x": np.array([1.0, -2.05], np.float32)}, None),
+        ({"bf16.x": np.array([1.0, -2.2], np.float32)}, "bf16.x: .* apart, at most 0.1"),
         ({"y": np.array([4])}, "y: only in one"),
     ],
 )
 def test_arrays(change: dict[str, np.ndarray], told: str | None) -> None:
     committed = {"x": np.array([1.0, -2.0], np.float32), "n": np.array([3])}
+    committed["bf16.x"] = committed["x"]
     found = golden.compared({**committed, **change}, committed)
     assert len(found) == (told is not None)
     if told is not None:

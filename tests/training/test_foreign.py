@@ -475,6 +475,21 @@ def test_weights_of_another_family_name_both():
     assert error.value.cause == "unknown"
 
 
+def test_weights_of_another_size_name_the_numbers_that_differ():
+    class Model:
+        width, depth, horizon = 8, 2, 5
+
+    with (
+        pytest.raises(CheckpointError) as error,
+        telling_families({"type": "Model", "width": 6, "depth": 2, "horizon": 7}, Model()),
+    ):
+        raise CheckpointError("they differ", cause="unknown")
+    assert error.value.cause == (
+        "the checkpoint's model has width 6, the config's 8; horizon 7, the config's 5"
+    )
+    assert error.value.next.startswith("--set model.width=6 --set model.horizon=7, and data")
+
+
 @pytest.mark.parametrize("key", ["runner.init_from", "model.pretrained_name_or_path"])
 def test_a_training_names_the_key_of_what_it_starts_from(tmp_path, key):
     config = tiny_config({"type": "OneProcessRunner", "max_steps": 1})

@@ -278,7 +278,7 @@ def test_openvla_gets_new_heads(tmp_path, capsys):
         == 0
     )
     # 16 of the head, 4 of the projector, and for 6 blocks two layers each.
-    assert "of which 44 are new" in capsys.readouterr().out
+    assert "; 44 are new" in capsys.readouterr().out
     found = OpenVLAFormat().read(out)
     table = {k: found.model[k] for k in ("type", "horizon", "action_dim", "state_dim", "use_film")}
     assert table == {

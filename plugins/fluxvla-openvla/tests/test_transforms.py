@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fluxvla_openvla.action_tokens import ActionTokens
 from fluxvla_openvla.images import (
     CenterCropOpenVLAImages,
     JitterOpenVLAColors,
@@ -12,6 +11,7 @@ from fluxvla_openvla.images import (
     crop_and_resize,
 )
 from fluxvla_openvla.normalize import DenormalizeOpenVLA, NormalizeOpenVLA, SampleDiffusionSteps
+from fluxvla_openvla.openvla import ActionTokens
 from fluxvla_openvla.prompts import ProcessOpenVLAPrompts
 from fluxvla_openvla.vision import for_dino
 

@@ -66,6 +66,24 @@ def test_it_acts_as_there_from_images_and_joints_to_commands(tmp_path, bring, fa
 
 
 @pytest.mark.parametrize("family", FAMILIES)
+def test_in_bf16_it_differs_no_more_than_there(tmp_path, bring, family):
+    golden = load_file(GOLDEN / f"lerobot061_{family}_policy.safetensors")
+    source, theirs = lerobot_folder(tmp_path / "theirs", family), weights(family, LEROBOT)
+    narrow = dict(zip(sorted(theirs), golden["bf16.dtypes"].tolist(), strict=True))
+    assert 0 < sum(narrow.values()) < len(narrow)
+    mixed = {name: t.bfloat16() if narrow[name] else t for name, t in theirs.items()}
+    save_file(mixed, source / "model.safetensors", {"format": "pt"})
+    policy = load_policy(bring(source))
+    policy.reset(pi_inputs.SEED)
+    found = policy.predict_action(observation(family))
+    exact, expected = (golden[n][0].double().numpy() for n in ("commands", "bf16.commands"))
+    rounding = np.abs(expected - exact).max()
+    assert rounding < 5e-2 * np.abs(exact).max()
+    assert 0 < np.abs(found - exact).max() < 2 * rounding
+    assert np.abs(found - expected).max() < 2 * rounding
+
+
+@pytest.mark.parametrize("family", FAMILIES)
 def test_what_the_model_gets_is_what_it_gets_there(tmp_path, family):
     golden = load_file(GOLDEN / f"lerobot061_{family}_policy.safetensors")
     words = tokenizer_folder(tmp_path / "words")

@@ -145,8 +145,8 @@ def test_other_tensors_are_refused_by_name(tmp_path, change, words):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda s: s.pop("actions"), "'actions' has not all of mean, std, q01, q99"),
-        (lambda s: s["state"].update(q01=None), "'state' has not all of"),
+        (lambda s: s.pop("actions"), "'actions' has no mean, std, q01, q99; it has nothing"),
+        (lambda s: s["state"].update(q01=None), "'state' has no q01; it has"),
         (lambda s: s["state"].update(q01=[0.0]), "are no rows of one length"),
         (lambda s: s["state"].update({key: [0.0] for key in s["state"]}), "is 0 throughout"),
     ],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fluxvla_smolvla.images import SmolVLAImages
-from fluxvla_smolvla.keys import published_names
+from fluxvla_smolvla.lerobot_files import published_names
 from fluxvla_smolvla.model import SmolVLA
 from fluxvla_smolvla.normalization import SmolVLANormalize
 
@@ -223,9 +223,17 @@ def test_sizes_that_do_not_fit_are_refused(settings, words):
 @pytest.mark.parametrize(
     ("key", "change", "words"),
     [
-        ("states", lambda v: v[:, :6], r"states of a sample have shape \(6,\), \(32,\)"),
-        ("actions", lambda v: v[:, :5], r"actions of a sample have shape \(5, 32\), \(7, 32\)"),
-        ("noise", lambda v: v[..., :5], r"noise of a sample have shape \(7, 5\), \(7, 32\)"),
+        ("states", lambda v: v[:, :6], "states have 6 numbers, max_state_dim is 32"),
+        (
+            "actions",
+            lambda v: v[:, :5],
+            r"actions are \(5, 32\) .* chunks \(7, 32\)",
+        ),
+        (
+            "noise",
+            lambda v: v[..., :5],
+            r"noise are \(7, 5\) .* chunks \(7, 32\)",
+        ),
         ("img_masks", lambda v: v[:, :1], "images have 6 channels, img_masks 1 cameras"),
         ("images", lambda v: v[:, :5], "images have 5 channels, img_masks 2 cameras"),
     ],
@@ -233,7 +241,7 @@ def test_sizes_that_do_not_fit_are_refused(settings, words):
 def test_batches_that_do_not_fit_are_refused(key, change, words):
     batch = model_batch()
     batch[key] = change(batch[key])
-    with pytest.raises(DataError, match=words):
+    with pytest.raises(ConfigError, match=words):
         tiny_model()(**batch)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fluxvla_smolvla.keys import published
+from fluxvla_smolvla.lerobot_files import published
 from safetensors.torch import load_file
 
 from .tiny import GOLDEN, HORIZON, VISION, WIDTH, model_batch, relative, tiny_model

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from fluxvla_smolvla.keys import published
+from fluxvla_smolvla.lerobot_files import published
 
 from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from fluxvla_smolvla.keys import published
+from fluxvla_smolvla.lerobot_files import published
 from fluxvla_smolvla.model import SmolVLA
 from safetensors.torch import save_file
 

@@ -322,8 +322,10 @@ def formats() -> tuple[list[CheckpointFormat], list[PluginError]]:
 
 @contextmanager
 def explain_other_family(table: Any, model: object) -> Iterator[None]:
-    """Let errors about weights say that the checkpoint's ``model`` table is of another class than
-    ``model``, if it is."""
+    """Add to errors about weights how the checkpoint's ``model`` table differs from ``model``.
+
+    It may name another class, or other numbers for the same class.
+    """
     try:
         yield
     except CheckpointError as error:
@@ -332,7 +334,24 @@ def explain_other_family(table: Any, model: object) -> Iterator[None]:
         if kind is not None and theirs != ours:
             error.cause = f"the checkpoint is of {theirs}, the config's model is {ours}"
             error.next = f"name a checkpoint of {ours}, or let the config's model be {theirs}"
+        elif differ := _other_numbers(table, model):
+            listed = (f"{key} {there}, the config's {here}" for key, there, here in differ)
+            error.cause = f"the checkpoint's model has {'; '.join(listed)}"
+            words = (f"--set model.{key}={there}" for key, there, _ in differ)
+            error.next = f"{' '.join(words)}, and data and transforms that fit; or other weights"
         raise
+
+
+def _other_numbers(table: Any, model: object) -> list[tuple[str, int, int]]:
+    """``(key, there, here)`` of whole numbers that ``model`` has otherwise than its table."""
+    if not isinstance(table, Mapping):
+        return []
+    pairs = ((key, there, getattr(model, key, None)) for key, there in table.items())
+    return [
+        (key, there, here)
+        for key, there, here in pairs
+        if type(there) is int and type(here) is int and there != here
+    ]
 
 
 def unknown_format(

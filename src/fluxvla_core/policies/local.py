@@ -14,7 +14,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.contracts.training import VLA
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, DataError
 from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
@@ -307,7 +307,11 @@ class LocalPolicy(Policy):
         """The observation with images of the size that the policy was trained on.
 
         The transforms may cut pixels by number. A camera with more pixels of the same view is
-        scaled down; ``run_setup`` has refused another view.
+        scaled down. ``run_setup`` has refused a robot whose cameras have another view; whoever
+        calls the policy directly learns of it here.
+
+        Raises:
+            DataError: an image of another aspect, beyond a hundredth.
         """
         images = dict(observation["images"])
         for camera in self.embodiment.cameras:
@@ -317,6 +321,14 @@ class LocalPolicy(Policy):
             if image.shape[:2] != (camera.height, camera.width):
                 import cv2
 
+                rows, columns = image.shape[:2]
+                apart = abs(columns * camera.height - camera.width * rows)
+                if camera.name in self.cameras and apart > 0.01 * rows * camera.width:
+                    raise DataError(
+                        f"camera {camera.name!r} gives {rows} x {columns} images; the policy was "
+                        f"trained on {camera.height} x {camera.width}: another view",
+                        next="set the camera to the size, or the aspect, of the recordings",
+                    )
                 size = (camera.width, camera.height)
                 images[camera.name] = np.asarray(
                     cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8

@@ -195,6 +195,7 @@ def _count(
             found.memory = memory_of(model, runner, inputs, processes, device_type)
         except Exception as error:  # noqa: BLE001 - another's model; an estimate must not end the run
             if isinstance(error, ConfigError) and inputs is not None:
+                error.where = error.where or runner.context.where("model")
                 found.refused = error
                 continue
             what = "activations are" if inputs is not None else "memory is"

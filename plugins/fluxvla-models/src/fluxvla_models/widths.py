@@ -27,15 +27,21 @@ def check_states(who: str, key: str, states: Tensor, width: int) -> None:
         )
 
 
-def check_actions(who: str, shape: tuple[int, ...], chunk: tuple[int, int]) -> None:
+def check_actions(
+    who: str, shape: tuple[int, ...], chunk: tuple[int, int], what: str = "actions"
+) -> None:
     """Compare the ``shape`` of a sample's actions with the model's ``chunk`` ``(T, D)``.
+
+    Args:
+        who: the model, for messages.
+        what: what has the shape, if it is not the actions: their noise.
 
     Raises:
         ConfigError: they differ; names both.
     """
     if shape != chunk:
         raise ConfigError(
-            f"{who}: actions are {shape} a sample, the model's chunks {chunk}",
+            f"{who}: {what} are {shape} a sample, the model's chunks {chunk}",
             cause="the model was made for another robot, or action_window_size is another",
             next="let train_dataloader.dataset.action_window_size be the model's horizon, and the "
             "width of the (padded) actions the model's",

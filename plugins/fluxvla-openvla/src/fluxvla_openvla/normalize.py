@@ -170,9 +170,9 @@ class Row:
         rows = dict(zip(names, (low, high, least, most), strict=True))
         sizes = {**{name: row.shape for name, row in rows.items()}, "mask": used.shape}
         if low.ndim != 1 or len(set(sizes.values())) > 1:
-            told = ", ".join(f"{math.prod(n)} in {name!r}" for name, n in sizes.items())
+            listed = ", ".join(f"{math.prod(n)} in {name!r}" for name, n in sizes.items())
             raise ConfigError(
-                f"the statistics of {key!r} are not rows of one length: {told}",
+                f"the statistics of {key!r} are not rows of one length: {listed}",
                 cause="the statistics or the mask belong to another robot",
             )
         return cls(low, high, used, least == most)

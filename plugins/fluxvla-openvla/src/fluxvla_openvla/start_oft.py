@@ -74,10 +74,7 @@ class StartOFT:
         started, fresh = with_new_parts(source, changes, platform, names, args.seed)
         _write(started, origin, target)
         count = sum(tensor.numel() for tensor in fresh.values())
-        print(
-            f"{target}: {len(started.tensors)} tensors, of which {len(fresh)} are new "
-            f"({count:,} numbers)"
-        )
+        print(f"{target}: {len(started.tensors)} tensors; {len(fresh)} are new ({count:,} numbers)")
         return 0
 
 

@@ -89,7 +89,7 @@ class ActionWords:
         """The ids of the FAST tokenizer in an ``answer`` without its ``bos``.
 
         What follows the first ``stop`` is left out, and so is ``begin`` wherever it stands. Other
-        words are no ids of actions, which the FAST tokenizer must tell.
+        words give ids that the FAST tokenizer does not have and refuses.
         """
         rest, begin = list(answer), list(self.begin)
         if self.stop in rest:

@@ -17,6 +17,7 @@ import torch
 from fluxvla_models.folded_attention import folded_mask
 from fluxvla_models.guidance import Guide
 from fluxvla_models.velocity import sample
+from fluxvla_models.widths import check_actions
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
@@ -386,13 +387,7 @@ class PiFlowMatching(VLA, nn.Module):
         return rope_of(positions, self.llm_expert.size.head_dim)
 
     def _check(self, chunk: Tensor, what: str) -> None:
-        if chunk.shape[1:] != self.action_shape:
-            raise ConfigError(
-                f"{what} of {tuple(chunk.shape[1:])}, the model has chunks of {self.action_shape} "
-                "(n_action_steps, max_action_dim)",
-                next="action_window_size of the dataset and action_dim of its "
-                "NormalizeStatesAndActions must be these",
-            )
+        check_actions(type(self).__name__, tuple(chunk.shape[1:]), self.action_shape, what)
 
 
 def time_features(tau: Tensor, width: int) -> Tensor:

@@ -132,7 +132,9 @@ class LeRobotPi0FastFormat(CheckpointFormat):
             ],
             statistics={"private": statistics_of(preparation, widths)},
             horizon=horizon,
-            notes=notes_of(preparation, tokenizer),
+            notes=notes_of(
+                preparation, tokenizer, count_of(config, "n_action_steps", horizon, where), horizon
+            ),
         )
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:

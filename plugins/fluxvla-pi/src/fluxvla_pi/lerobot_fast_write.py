@@ -20,13 +20,12 @@ from fluxvla_core.models import ForeignCheckpoint
 from fluxvla_core.results import read_json
 from fluxvla_pi.action_tokens import ActionWords
 from fluxvla_pi.lerobot_format import write_policy
-from fluxvla_pi.published import FAST
-from fluxvla_pi.writing import only, table_of
+from fluxvla_pi.published import FAST, only, table_of
 
 TOKENIZER = "lerobot/fast-action-tokenizer"
 """The tokenizer of actions that LeRobot names."""
 PUBLISHED = {"scale": 10, "min_token": -354, "vocab_size": 2048}
-"""Its settings, which tell it from one that is fitted to a dataset."""
+"""Its settings; a tokenizer that is fitted to a dataset has others."""
 SIZES: Mapping[str, Any] = {
     "variant": "gemma_2b",
     "vision_variant": "so400m",

@@ -40,8 +40,15 @@ from fluxvla_pi.lerobot_processors import (
     write_processors,
 )
 from fluxvla_pi.names import LEROBOT
-from fluxvla_pi.published import FAMILIES, weights_in
-from fluxvla_pi.writing import action_names, only, table_of, weights_to_write
+from fluxvla_pi.published import (
+    FAMILIES,
+    action_names,
+    family_of,
+    only,
+    table_of,
+    weights_in,
+    weights_to_write,
+)
 
 IMAGES = "observation.images."
 _EMPTY = f"{IMAGES}empty_camera_"
@@ -147,14 +154,14 @@ class LeRobotPiFormat(CheckpointFormat):
             transforms=_transforms(model, preparation, size, tokenizer),
             statistics={"private": statistics_of(preparation, widths)},
             horizon=horizon,
-            notes=notes_of(preparation, tokenizer),
+            notes=notes_of(
+                preparation, tokenizer, count_of(config, "n_action_steps", horizon, where), horizon
+            ),
         )
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
         """Write ``checkpoint`` into ``folder``; see ``CheckpointFormat``."""
-        family = next(
-            f for f, kind in FAMILIES.items() if kind.__name__ in checkpoint.model["type"]
-        )
+        family = family_of(checkpoint)
         _check_sizes(checkpoint)
         if family == "pi0":
             only(table_of(checkpoint, "PreparePrompt"), "clean", False, True)
@@ -284,9 +291,17 @@ def statistics_of(preparation: Preparation, widths: Mapping[str, int]) -> dict[s
     return found
 
 
-def notes_of(preparation: Preparation, tokenizer: str | None) -> list[str]:
-    """What a user should know of the import."""
+def notes_of(
+    preparation: Preparation, tokenizer: str | None, executed: int, horizon: int
+) -> list[str]:
+    """What a user should know of the import.
+
+    Args:
+        executed: actions of a chunk that LeRobot executes, of ``horizon``.
+    """
     notes = []
+    if executed < horizon:
+        notes.append(f"LeRobot executes {executed} of its {horizon} actions: execute_horizon")
     none = [
         key
         for key in KEYS
@@ -326,7 +341,7 @@ def write_policy(
     """
     preparation = _preparation(checkpoint)
     tensors = weights_to_write(checkpoint, LEROBOT)
-    # A matrix tells: LeRobot keeps the weights of normalisations in float32 beside bf16.
+    # By a matrix: LeRobot keeps the weights of normalisations in float32 beside bf16.
     matrix = LEROBOT.theirs("llm_backbone.layers.0.self_attn.q_proj.weight")
     narrow = tensors[matrix].dtype == torch.bfloat16
     config = {
@@ -347,7 +362,8 @@ def _check_sizes(checkpoint: ForeignCheckpoint) -> None:
     if sizes != _VARIANTS or model.get("vocab_size", 257152) != VOCABULARY:
         raise CheckpointError(
             f"LeRobot's policies have the sizes {', '.join(_VARIANTS.values())}; this one has "
-            f"{', '.join(map(str, sizes.values()))}"
+            f"{', '.join(map(str, sizes.values()))}",
+            next="--format openpi writes any size",
         )
 
 

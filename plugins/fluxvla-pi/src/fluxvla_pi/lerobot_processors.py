@@ -332,7 +332,7 @@ def _apart(relative: Sequence[bool], names: Sequence[str]) -> list[str]:
     """Names of the joints that are not relative.
 
     Raises:
-        CheckpointError: joints are told apart by names, and these do not.
+        CheckpointError: no names by which LeRobot could distinguish them.
     """
     if all(relative):
         return []
@@ -340,7 +340,7 @@ def _apart(relative: Sequence[bool], names: Sequence[str]) -> list[str]:
     config = {"exclude_joints": apart, "action_names": list(names)}
     if not apart or _relative(config, len(relative)) != list(relative):
         raise CheckpointError(
-            "some actions are relative to the state and some are not; LeRobot tells them apart by "
-            f"names, which {', '.join(names) or 'no names'} do not"
+            "some actions are relative to the state and some are not; LeRobot distinguishes "
+            f"them by name, which {', '.join(names) or 'no names'} do not allow"
         )
     return apart

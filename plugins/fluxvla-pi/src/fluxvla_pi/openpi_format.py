@@ -1,6 +1,6 @@
 """PI0 and PI0.5 as openpi saves them in PyTorch: weights and ``assets/<id>/norm_stats.json``.
 
-``config.json`` is there if the weights were converted from JAX, and tells the length of a chunk.
+``config.json`` is there if the weights were converted from JAX, and has the length of a chunk.
 Which robot it is, and what openpi's data config did to states and actions before (actions relative
 to the state, joints turned round), is in no file.
 """
@@ -26,8 +26,14 @@ from fluxvla_core.models import (
 )
 from fluxvla_core.results import read_json
 from fluxvla_pi.names import OPENPI
-from fluxvla_pi.published import FAMILIES, weights_in
-from fluxvla_pi.writing import only, table_of, weights_to_write
+from fluxvla_pi.published import (
+    FAMILIES,
+    family_of,
+    only,
+    table_of,
+    weights_in,
+    weights_to_write,
+)
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
 STATISTICS = "norm_stats.json"
@@ -98,7 +104,7 @@ class OpenPiFormat(CheckpointFormat):
                 "--robot NAME; as it is, it can be trained on, and drives none"
             )
         if not known:
-            notes.append(f"config.json tells no action_horizon: chunks of {HORIZON} are assumed")
+            notes.append(f"config.json has no action_horizon: chunks of {HORIZON} are assumed")
         if cut:
             notes.append("dimensions that openpi had only filled up with zeros were left out")
         if tokenizer is None:
@@ -117,9 +123,7 @@ class OpenPiFormat(CheckpointFormat):
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
         """Write ``checkpoint`` into ``folder``; see ``CheckpointFormat``."""
-        family = next(
-            f for f, kind in FAMILIES.items() if kind.__name__ in checkpoint.model["type"]
-        )
+        family = family_of(checkpoint)
         numbers = table_of(checkpoint, "NormalizeStatesAndActions")
         only(numbers, "norm_type", NORM_TYPES[family], "mean_std")
         only(numbers, "state_norm_type", numbers.get("norm_type", "mean_std"), NORM_TYPES[family])
@@ -172,9 +176,14 @@ def _statistics(file: Path, family: str) -> tuple[dict[str, Any], bool]:
     for theirs, ours in ENTRIES.items():
         tables = content.get("norm_stats")
         table = tables.get(theirs) if isinstance(tables, Mapping) else None
-        if not isinstance(table, Mapping) or any(table.get(name) is None for name in wanted):
+        table = table if isinstance(table, Mapping) else {}
+        lacks = [name for name in wanted if table.get(name) is None]
+        if lacks:
             raise CheckpointError(
-                f"norm_stats: {theirs!r} has not all of {', '.join(wanted)}", where=where
+                f"norm_stats: {theirs!r} has no {', '.join(lacks)}; it has "
+                f"{', '.join(sorted(table)) or 'nothing'}",
+                where=where,
+                next="compute the statistics again with openpi's scripts/compute_norm_stats.py",
             )
         given = {n: table[n] for n in ("mean", "std", "q01", "q99") if table.get(n) is not None}
         try:
@@ -198,7 +207,7 @@ def _statistics(file: Path, family: str) -> tuple[dict[str, Any], bool]:
 
 
 def _horizon(folder: Path) -> tuple[int, bool]:
-    """Actions in a chunk, and whether a file tells it."""
+    """Actions in a chunk, and whether a file says so."""
     file = folder / "config.json"
     if not os.path.lexists(file):
         return HORIZON, False

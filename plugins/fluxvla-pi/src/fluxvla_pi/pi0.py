@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from fluxvla_models.widths import check_states
@@ -14,40 +15,17 @@ from fluxvla_pi.flow_matching import PiFlowMatching, Suffix, time_features
 
 
 class PI0FlowMatching(PiFlowMatching):
-    """PI0; arguments as of ``PiFlowMatching``, and ``max_state_dim``, the width of states."""
+    """PI0: the state is a token, and the time joins every action.
+
+    Args:
+        max_state_dim: width of (padded) states.
+        **kwargs: as ``PiFlowMatching`` takes them.
+    """
 
     adaptive = False
 
-    def __init__(
-        self,
-        variant: str | Mapping[str, int] = "gemma_2b",
-        expert_variant: str | Mapping[str, int] = "gemma_300m",
-        vision_variant: str | Mapping[str, int] = "so400m",
-        n_action_steps: int = 50,
-        max_action_dim: int = 32,
-        max_state_dim: int = 32,
-        ori_action_dim: int | None = None,
-        num_steps: int = 10,
-        prefix_conditioning: bool = False,
-        vocab_size: int = 257152,
-        freeze_vision_backbone: bool = False,
-        freeze_llm_backbone: bool = False,
-        pretrained_name_or_path: str | None = None,
-    ) -> None:
-        super().__init__(
-            variant=variant,
-            expert_variant=expert_variant,
-            vision_variant=vision_variant,
-            n_action_steps=n_action_steps,
-            max_action_dim=max_action_dim,
-            ori_action_dim=ori_action_dim,
-            num_steps=num_steps,
-            prefix_conditioning=prefix_conditioning,
-            vocab_size=vocab_size,
-            freeze_vision_backbone=freeze_vision_backbone,
-            freeze_llm_backbone=freeze_llm_backbone,
-            pretrained_name_or_path=pretrained_name_or_path,
-        )
+    def __init__(self, max_state_dim: int = 32, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         width = self.llm_expert.size.width
         self.max_state_dim = max_state_dim
         self.state_proj = nn.Linear(max_state_dim, width)
@@ -60,7 +38,7 @@ class PI0FlowMatching(PiFlowMatching):
         times = time_features(tau, actions.shape[-1])
         if tau.ndim == 1:
             times = times[:, None]
-        hidden = torch.cat([self.state_tokens(states), self._told(actions, times)], dim=1)
+        hidden = torch.cat([self.state_tokens(states), self._with_time(actions, times)], dim=1)
         blocks = torch.ones(hidden.shape[1], dtype=torch.long, device=x.device)
         blocks[0] = 0
         return Suffix(hidden, None, blocks)
@@ -73,7 +51,7 @@ class PI0FlowMatching(PiFlowMatching):
     def tokens_at(self, x: Tensor, seen: Seen, tables: Mapping[str, Tensor], step: int) -> Tensor:
         """The state's token, and actions that know the time."""
         assert seen.state is not None
-        actions = self._told(self.action_in_proj(x), tables["times"][step])
+        actions = self._with_time(self.action_in_proj(x), tables["times"][step])
         return torch.cat([seen.state, actions], dim=1)
 
     def attended(self, device: torch.device) -> Tensor:
@@ -86,7 +64,7 @@ class PI0FlowMatching(PiFlowMatching):
         check_states(type(self).__name__, "max_state_dim", states, self.max_state_dim)
         return self.state_proj(states)[:, None]
 
-    def _told(self, actions: Tensor, times: Tensor) -> Tensor:
-        """``(B, T, W)`` told the time, ``times`` being broadcast to them."""
+    def _with_time(self, actions: Tensor, times: Tensor) -> Tensor:
+        """Actions ``(B, T, W)`` joined with ``times``, which are broadcast to them."""
         joined = torch.cat([actions, times.to(actions.dtype).expand_as(actions)], dim=-1)
         return self.action_time_mlp_out(functional.silu(self.action_time_mlp_in(joined)))

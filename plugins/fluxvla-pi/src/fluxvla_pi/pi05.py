@@ -4,6 +4,7 @@ conditions every normalisation of the expert."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,39 +15,16 @@ from fluxvla_pi.flow_matching import PiFlowMatching, Suffix, time_features
 
 
 class PI05FlowMatching(PiFlowMatching):
-    """PI0.5; arguments as of ``PiFlowMatching``. ``states`` reach it as words of the prompt."""
+    """PI0.5, whose ``states`` are words of the prompt.
+
+    Args:
+        **kwargs: as ``PiFlowMatching`` takes them.
+    """
 
     adaptive = True
 
-    def __init__(
-        self,
-        variant: str | Mapping[str, int] = "gemma_2b",
-        expert_variant: str | Mapping[str, int] = "gemma_300m",
-        vision_variant: str | Mapping[str, int] = "so400m",
-        n_action_steps: int = 50,
-        max_action_dim: int = 32,
-        ori_action_dim: int | None = None,
-        num_steps: int = 10,
-        prefix_conditioning: bool = False,
-        vocab_size: int = 257152,
-        freeze_vision_backbone: bool = False,
-        freeze_llm_backbone: bool = False,
-        pretrained_name_or_path: str | None = None,
-    ) -> None:
-        super().__init__(
-            variant=variant,
-            expert_variant=expert_variant,
-            vision_variant=vision_variant,
-            n_action_steps=n_action_steps,
-            max_action_dim=max_action_dim,
-            ori_action_dim=ori_action_dim,
-            num_steps=num_steps,
-            prefix_conditioning=prefix_conditioning,
-            vocab_size=vocab_size,
-            freeze_vision_backbone=freeze_vision_backbone,
-            freeze_llm_backbone=freeze_llm_backbone,
-            pretrained_name_or_path=pretrained_name_or_path,
-        )
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         width = self.llm_expert.size.width
         self.time_mlp_in = nn.Linear(width, width)
         self.time_mlp_out = nn.Linear(width, width)

@@ -1,20 +1,21 @@
-"""Weights of published files: which model they are of, and its tensors."""
+"""Weights and settings of published files: reading them, and what writing them needs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import isqrt
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from fluxvla_models.lerobot_files import whole
+from torch import Tensor, nn
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.models import Stored, safetensors_in
+from fluxvla_core.models import ForeignCheckpoint, Stored, safetensors_in
 from fluxvla_pi.flow_matching import PiFlowMatching
-from fluxvla_pi.names import Layout, actual_names, layout_of, sources
+from fluxvla_pi.names import Layout, actual_names, layout_of, published, sources
 from fluxvla_pi.pi0 import PI0FlowMatching
 from fluxvla_pi.pi0_fast import PI0FAST
 from fluxvla_pi.pi05 import PI05FlowMatching
@@ -34,7 +35,7 @@ class Weights:
     Args:
         family: ``pi0``, ``pi05`` or ``pi0_fast``.
         model: the config's table, without ``n_action_steps`` and, of PI0-FAST, ``action_dim`` and
-            ``tokenizer``, which no shape tells.
+            ``tokenizer``, which do not follow from shapes.
         tensors: by our names.
     """
 
@@ -44,7 +45,7 @@ class Weights:
 
 
 def weights_in(folder: Path, besides: Iterable[str] = ()) -> Weights:
-    """The weights of ``model.safetensors`` in ``folder``, of the model that their shapes tell.
+    """The weights in ``folder/model.safetensors``, and the model that follows from their shapes.
 
     Args:
         besides: tensors in the file that are none of the model's.
@@ -93,7 +94,7 @@ class _Shapes:
         return "pi05" if self.has("time_mlp_in.weight") else "pi0"
 
     def table(self, family: str) -> dict[str, Any]:
-        """The model's arguments that shapes tell."""
+        """The model's arguments that follow from shapes."""
         vocabulary, _ = self._two(self._embedding())
         table: dict[str, Any] = {
             "variant": _named(self._gemma("llm_backbone"), GEMMA),
@@ -164,3 +165,62 @@ def _built(family: str, table: Mapping[str, Any]) -> nn.Module:
 def _named(size: Any, known: Mapping[str, Any]) -> Any:
     """The name of ``size`` where it has one, else its numbers."""
     return next((name for name, other in known.items() if other == size), asdict(size))
+
+
+# -- writing ---------------------------------------------------------------------------------
+
+
+def family_of(checkpoint: ForeignCheckpoint) -> str:
+    """``pi0`` or ``pi05``."""
+    kind = str(checkpoint.model["type"]).rpartition(":")[2]
+    return next(family for family, cls in FAMILIES.items() if cls.__name__ == kind)
+
+
+def weights_to_write(checkpoint: ForeignCheckpoint, layout: Layout) -> dict[str, Tensor]:
+    """The weights under the names of ``layout``, and what nothing uses as zeros."""
+    names = published(list(checkpoint.tensors), layout)
+    found = {theirs: whole(checkpoint.tensors[ours]) for theirs, ours in names.items()}
+    embedding = whole(checkpoint.tensors["llm_backbone.embed_tokens.weight"])
+    expert = checkpoint.tensors.get("action_in_proj.weight")
+    for name in layout.unused if expert is not None else ():
+        found[name] = torch.zeros(len(embedding), expert.shape[0], dtype=embedding.dtype)
+    owners: set[int] = set()
+    for name, tensor in found.items():  # the format has no two names of one memory
+        found[name] = tensor.clone() if tensor.data_ptr() in owners else tensor.contiguous()
+        owners.add(tensor.data_ptr())
+    return found
+
+
+def table_of(checkpoint: ForeignCheckpoint, kind: str) -> Mapping[str, Any]:
+    """The table of the transform ``kind``.
+
+    Raises:
+        CheckpointError: there is none: observations are prepared in another way.
+    """
+    for table in checkpoint.transforms:
+        if str(table.get("type")).rpartition(":")[2] == kind:
+            return table
+    raise CheckpointError(
+        f"there is no {kind} among the transforms; observations are prepared in a way "
+        "that the format does not know"
+    )
+
+
+def only(table: Mapping[str, Any], key: str, wanted: Any, default: Any) -> None:
+    """Check that a setting is the one that the format implies.
+
+    Raises:
+        CheckpointError: it is another.
+    """
+    value = table.get(key, default)
+    if value != wanted:
+        raise CheckpointError(
+            f"{table['type']}: {key} is {value!r}; the format implies {wanted!r}",
+            next=f"train with {key}={wanted!r}",
+        )
+
+
+def action_names(checkpoint: ForeignCheckpoint) -> Sequence[str] | None:
+    """The names of the robot's joints, where the checkpoint describes the robot."""
+    robot = checkpoint.embodiment
+    return None if robot is None else tuple(joint.name for joint in robot.joints)

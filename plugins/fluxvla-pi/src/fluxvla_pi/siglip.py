@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fluxvla_core.errors import DataError
+from fluxvla_core.errors import ConfigError
 from fluxvla_pi.sizes import SiglipSize
 
 EPS = 1e-6
@@ -73,11 +73,11 @@ class SiglipVisionTower(nn.Module):
         """``(B, 3, H, W)`` in -1..1 -> ``(B, patches, width)``.
 
         Raises:
-            DataError: the images have another size than the tower was made for.
+            ConfigError: the images have another size than the tower was made for.
         """
         side = self.size.image_size
         if images.shape[1:] != (3, side, side):
-            raise DataError(
+            raise ConfigError(
                 f"the vision tower takes images of 3 x {side} x {side}, "
                 f"got {' x '.join(str(n) for n in images.shape[1:])}",
                 next=f"dict(type='ResizeImagesWithPad', height={side}, width={side}) "

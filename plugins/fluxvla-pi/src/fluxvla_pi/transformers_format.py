@@ -27,7 +27,7 @@ _FIXED: Mapping[tuple[str, ...], Any] = {
     ("dit_config", "num_key_value_heads"): KEY_HEADS,
     ("vlm_config", "vision_config", "num_attention_heads"): VISION_HEADS,
 }
-"""Settings that no shape tells, and the values that are built here."""
+"""Settings that do not follow from shapes, and the values that are built here."""
 _NOTE = (
     "transformers' files name no cameras, and its processor prepares images in another way than "
     "openpi and LeRobot: it can be trained on, and drives no robot"

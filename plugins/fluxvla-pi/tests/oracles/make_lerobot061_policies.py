@@ -5,7 +5,9 @@
 
 What ``save_pretrained`` writes is stored but for the weights, which follow from their names. The
 policy and its processors are loaded from there again before they act. LeRobot names a tokenizer of
-the hub; it gets one of single letters instead.
+the hub; it gets one of single letters instead. ``bf16.`` is what the same policy does with
+``dtype="bfloat16"``, which LeRobot gives to some of the tensors only: ``bf16.dtypes`` says to which
+of their sorted names.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ class LocalTokenizer:
         )
 
 
-def build(family: str):
+def build(family: str, **more):
     cameras = {
         f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *size))
         for name, size in tiny.SIZES_OF_CAMERAS.items()
@@ -58,6 +60,7 @@ def build(family: str):
         input_features={**cameras, "observation.state": state},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (tiny.ROBOT_ACTIONS,))},
         **SETTINGS[family],
+        **more,
     )
 
 
@@ -93,6 +96,10 @@ def numbers(family: str, folder: Path) -> dict[str, torch.Tensor]:
     batch = before(raw)
     noise = torch.from_numpy(tiny.first_noise())
     found["commands"] = after(policy.predict_action_chunk(batch, noise=noise))
+    narrow = build(family, dtype="bfloat16")
+    state = narrow.state_dict()
+    found["bf16.dtypes"] = torch.tensor([state[n].dtype == torch.bfloat16 for n in sorted(state)])
+    found["bf16.commands"] = after(narrow.predict_action_chunk(before(raw), noise=noise)).float()
     return found
 
 

@@ -25,8 +25,8 @@ class Expert(nn.Module):
             are joined with self-attention between actions, the others crossed; 0 crosses all.
 
     Raises:
-        ConfigError: counted in the expert's layers, other layers would be crossed: the published
-            names could not tell which.
+        ConfigError: counted in the expert's layers, other layers would be crossed, and the
+            published names do not say which.
     """
 
     def __init__(self, size: TextSize, stride: int, self_attn_every_n_layers: int) -> None:

@@ -27,11 +27,12 @@ from fluxvla_core.models import (
     without_cameras,
 )
 from fluxvla_core.results import read_json
-from fluxvla_smolvla.keys import published, published_names
-from fluxvla_smolvla.lerobot_processors import (
+from fluxvla_smolvla.lerobot_files import (
     Processors,
     buffered_statistics,
     norms_of,
+    published,
+    published_names,
     read_processors,
 )
 from fluxvla_smolvla.lerobot_write import write
@@ -289,7 +290,7 @@ class Settings:
         )
 
     def statistics(self, processors: Processors) -> dict[str, Any]:
-        """Our entries; where nothing is normalised, zeros and ones tell the width."""
+        """Our entries; where nothing is normalised, zeros and ones of the same width."""
         found: dict[str, Any] = {}
         for feature, kind, entry, section in (
             (STATE, "STATE", "proprio", "input_features"),

@@ -8,13 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fluxvla_models.lerobot_files import ACTION, EPS, POSTPROCESSOR, PREPROCESSOR, STATE, whole
+from fluxvla_models.lerobot_files import (
+    ACTION,
+    EPS,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    STATE,
+    whole,
+    write_steps,
+)
 from safetensors.torch import save_file
 
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import ForeignCheckpoint
-from fluxvla_smolvla.keys import published_names
-from fluxvla_smolvla.lerobot_processors import NORMS, Statistics
+from fluxvla_smolvla.lerobot_files import NORMS, Statistics, published_names
 from fluxvla_smolvla.model import SMOLVLM2
 from fluxvla_smolvla.sizes import TextSize, VisionSize, size_of
 
@@ -40,7 +47,8 @@ def write(checkpoint: ForeignCheckpoint, folder: Path) -> None:
     Raises:
         CheckpointError: its transforms are not those that LeRobot has, or it has no statistics.
     """
-    transforms = {table.get("type"): table for table in checkpoint.transforms}
+    # A type may be named with its distribution.
+    transforms = {str(t.get("type")).rpartition(":")[2]: t for t in checkpoint.transforms}
     missing = [
         name
         for name in ("SmolVLAImages", "SmolVLANormalize", "SmolVLAPrompt", "ProcessPrompts")
@@ -53,7 +61,7 @@ def write(checkpoint: ForeignCheckpoint, folder: Path) -> None:
         )
     statistics = _statistics(checkpoint)
     config = _config(checkpoint, transforms, statistics)
-    _dump(config, folder / "config.json")
+    (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
     names = published_names(checkpoint.tensors)
     tensors = {theirs: whole(checkpoint.tensors[ours]) for ours, theirs in names.items()}
     save_file(
@@ -89,14 +97,11 @@ def write(checkpoint: ForeignCheckpoint, folder: Path) -> None:
         for name, values in entry.items()
     }
     for stem, steps in ((PREPROCESSOR, before), (POSTPROCESSOR, after)):
-        listed = []
-        for number, (name, settings) in enumerate(steps):
-            step: dict[str, Any] = {"registry_name": name, "config": settings}
-            if name.endswith("normalizer_processor"):
-                step["state_file"] = f"{stem}_step_{number}_{name}.safetensors"
-                save_file(flat, folder / step["state_file"])
-            listed.append(step)
-        _dump({"name": stem, "steps": listed}, folder / f"{stem}.json")
+        write_steps(
+            folder,
+            stem,
+            [(n, s, flat if n.endswith("normalizer_processor") else {}) for n, s in steps],
+        )
 
 
 def _config(
@@ -165,7 +170,3 @@ def _statistics(checkpoint: ForeignCheckpoint) -> Statistics:
 
 def _shape(statistics: Statistics, feature: str) -> list[int]:
     return [len(next(iter(statistics[feature].values())))]
-
-
-def _dump(content: Mapping[str, Any], path: Path) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

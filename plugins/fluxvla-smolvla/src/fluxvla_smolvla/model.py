@@ -15,12 +15,12 @@ from typing import Any
 import torch
 from fluxvla_models.guidance import Guide
 from fluxvla_models.velocity import sample
+from fluxvla_models.widths import check_actions, check_states
 from torch import Tensor, nn
 
-from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
-from fluxvla_smolvla.loss import masked_mean
 from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
 from fluxvla_smolvla.transformer import ContextLayer, KVCache, Prefix, RMSNorm, Rotation
 from fluxvla_smolvla.vision import Connector, VisionTower, resize_with_pad
@@ -189,8 +189,8 @@ class SmolVLA(VLA, nn.Module):
                 and their errors count as 0, for ``prefix_conditioning``.
 
         Raises:
-            DataError: an input of a width that the model does not have.
-            ConfigError: ``prefix_len`` without ``prefix_conditioning``, or the reverse.
+            ConfigError: an input of a width that the model does not have; ``prefix_len`` without
+                ``prefix_conditioning``, or the reverse.
         """
         if self.prefix_conditioning != (prefix_len is not None):
             raise ConfigError(
@@ -199,9 +199,9 @@ class SmolVLA(VLA, nn.Module):
                 next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
                 "prefix_len among the collator's keys, belong to prefix_conditioning=True",
             )
-        repeats, shape = noise.shape[1], self.action_shape
-        _expect("actions", actions.shape[1:], "n_action_steps and max_action_dim", shape)
-        _expect("noise", noise.shape[2:], "n_action_steps and max_action_dim", shape)
+        repeats = noise.shape[1]
+        check_actions("SmolVLA", tuple(actions.shape[1:]), self.action_shape)
+        check_actions("SmolVLA", tuple(noise.shape[2:]), self.action_shape, "noise")
         cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
         cache = cache.repeat_interleave(repeats)
         t, given = 1.0 - time, None
@@ -217,7 +217,7 @@ class SmolVLA(VLA, nn.Module):
         if given is not None:
             errors = errors * ~given[..., None]
         errors = errors[..., : self.ori_action_dim]
-        loss, each = masked_mean(errors, action_masks, self.loss_mean)
+        loss, each = _masked_mean(errors, action_masks, self.loss_mean)
         return {"loss": loss, "sample_losses": each.detach()}
 
     def predict_action(
@@ -243,9 +243,9 @@ class SmolVLA(VLA, nn.Module):
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
 
         Raises:
-            DataError: an input of a width that the model does not have.
+            ConfigError: an input of a width that the model does not have.
         """
-        _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
+        check_actions("SmolVLA", tuple(noise.shape[1:]), self.action_shape, "noise")
         own = None if self.prefix_conditioning else self.ori_action_dim
         guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight, own)
         if guide is None:
@@ -275,7 +275,7 @@ class SmolVLA(VLA, nn.Module):
         """What the steps need of an observation, arguments as of ``forward``: ``Expert.observe``.
 
         Raises:
-            DataError: an input of a width that the model does not have.
+            ConfigError: an input of a width that the model does not have.
         """
         cache = self._encode_prefix(images, img_masks, lang_tokens, lang_masks, states)
         return self.expert.observe(cache, self.n_action_steps)
@@ -284,7 +284,7 @@ class SmolVLA(VLA, nn.Module):
         self, seen: Mapping[str, Tensor], noise: Tensor, tables: Mapping[str, Tensor]
     ) -> Tensor:
         """All steps by Euler's method: ``noise`` ``(B, T, D)`` -> actions ``(B, T, D)``."""
-        _expect("noise", noise.shape[1:], "n_action_steps and max_action_dim", self.action_shape)
+        check_actions("SmolVLA", tuple(noise.shape[1:]), self.action_shape, "noise")
         x = noise
         for step in range(self.num_steps):
             tokens = self.embed_actions.embed_at_time(x, tables["times"][step])
@@ -323,11 +323,11 @@ class SmolVLA(VLA, nn.Module):
         """The KV cache of images, instruction and state."""
         cameras, rest = divmod(images.shape[1], 3)
         if rest or cameras != img_masks.shape[1]:
-            raise DataError(
+            raise ConfigError(
                 f"SmolVLA: images have {images.shape[1]} channels, img_masks {img_masks.shape[1]} "
                 "cameras; 3 channels each are expected"
             )
-        _expect("states", states.shape[1:], "max_state_dim", (self.max_state_dim,))
+        check_states("SmolVLA", "max_state_dim", states, self.max_state_dim)
         features = self._encode_images(images.unflatten(1, (cameras, 3)).flatten(0, 1))
         features = features.unflatten(0, (-1, cameras))
         image_mask = img_masks.bool()[..., None].expand(-1, -1, features.shape[2])
@@ -399,11 +399,17 @@ def _check_counts(experts: int, layers: int, **counts: int) -> None:
         )
 
 
-def _expect(what: str, found: Any, names: str, expected: tuple[int, ...]) -> None:
-    if tuple(found) != expected:
-        raise DataError(
-            f"SmolVLA: {what} of a sample have shape {tuple(found)}, {expected} ({names}) is "
-            "expected",
-            next="the transforms pad and cut: compare their widths and action_window_size with "
-            "the model's",
-        )
+def _masked_mean(errors: Tensor, masks: Tensor, over: str) -> tuple[Tensor, Tensor]:
+    """The loss of a batch, and that of each sample, ``(B,)``.
+
+    Args:
+        errors: ``(B, K, T, D)``.
+        masks: ``(B, T)``, 0 beyond the end of an episode.
+        over: ``valid``: the mean over steps inside episodes; ``all``: the others count as 0, so
+            that the gradient does not depend on which samples share a batch.
+    """
+    kept = errors * masks[:, None, :, None]
+    if over == "all":
+        return kept.mean(), kept.flatten(1).mean(1)
+    each = masks.sum(1).to(errors.dtype) * errors.shape[1] * errors.shape[3]
+    return kept.sum() / each.sum().clamp_min(1), kept.flatten(1).sum(1) / each.clamp_min(1)

@@ -1,4 +1,4 @@
-"""Files around LeRobot's policies: processors with their statistics, and what their names mean.
+"""LeRobot's files of a SmolVLA: names of tensors, and processors with their statistics.
 
 LeRobot 0.4 and later saves ``policy_preprocessor.json`` and ``policy_postprocessor.json``, lists of
 steps; a step's tensors are in a safetensors file that it names (lerobot/processor/pipeline.py).
@@ -9,7 +9,7 @@ Earlier ones kept the statistics as buffers between the weights:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,20 @@ from fluxvla_models.lerobot_files import (
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import Stored
 
+_VLM = "model.vlm_with_expert.vlm."
+PREFIXES = {
+    "vision.layers.": f"{_VLM}model.vision_model.encoder.layers.",
+    "vision.post_layernorm.": f"{_VLM}model.vision_model.post_layernorm.",
+    "vision.": f"{_VLM}model.vision_model.embeddings.",
+    "connector.proj.": f"{_VLM}model.connector.modality_projection.proj.",
+    "text.": f"{_VLM}model.text_model.",
+    "lm_head.": f"{_VLM}lm_head.",
+    "expert.": "model.vlm_with_expert.lm_expert.",
+    "embed_actions.": "model.",
+    "state_proj.": "model.state_proj.",
+    "action_out_proj.": "model.action_out_proj.",
+}
+"""Prefix of a name here -> prefix there; the first that fits counts."""
 NORMS = {
     "MEAN_STD": "mean_std",
     "MIN_MAX": "min_max",
@@ -50,6 +64,19 @@ _BUFFERS = {
 }
 Statistics = dict[str, dict[str, list[float]]]
 """Feature -> statistic -> numbers, one for each dimension."""
+
+
+def published(name: str) -> str:
+    """LeRobot's name of the tensor that is ``name`` in ``SmolVLA().state_dict()``."""
+    for ours, theirs in PREFIXES.items():
+        if name.startswith(ours):
+            return theirs + name.removeprefix(ours)
+    raise KeyError(name)
+
+
+def published_names(names: Iterable[str]) -> dict[str, str]:
+    """``{name here: name there}`` of all tensors of a model."""
+    return {name: published(name) for name in names}
 
 
 @dataclass(frozen=True)

@@ -481,7 +481,7 @@ def test_weights_of_another_size_name_the_numbers_that_differ():
 
     with (
         pytest.raises(CheckpointError) as error,
-        telling_families({"type": "Model", "width": 6, "depth": 2, "horizon": 7}, Model()),
+        explain_other_family({"type": "Model", "width": 6, "depth": 2, "horizon": 7}, Model()),
     ):
         raise CheckpointError("they differ", cause="unknown")
     assert error.value.cause == (

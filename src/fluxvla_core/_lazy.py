@@ -27,8 +27,9 @@ def attach(
             is not in ``__all__``.
     """
     public: Any = sys.modules[module]
-    with open(public.__file__, encoding="utf-8") as file:
-        sources = {name: source for source, name in _IMPORT.findall(file.read())}
+    # By the loader: the package may be in an archive.
+    text = public.__loader__.get_data(public.__file__).decode()
+    sources = {name: source for source, name in _IMPORT.findall(text)}
     renamed = dict(deprecated or {})
 
     def __getattr__(name: str) -> Any:

@@ -10,6 +10,7 @@ import json
 import os
 import re
 import signal
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -37,6 +38,10 @@ OPERATORS.unregister("ProgramArm")
 class ProgramArm(program.ProgramArm):
     pass
 """
+(FROZEN,) = (fault for fault in PROCESS_FAULTS if "Cyclone" in fault.name)
+without_cyclone = pytest.mark.skipif(
+    find_spec("cyclonedds") is None, reason="Cyclone DDS has no wheel for this Python"
+)
 QUESTION = "task id or instruction (empty ends):"
 
 
@@ -47,8 +52,16 @@ def stage(ros_domain):
 
 
 def of(outcome):
-    faults = [fault for fault in PROCESS_FAULTS if fault.outcome == outcome]
-    return [pytest.param(fault, id=fault.name.removeprefix(PREFIX)) for fault in faults]
+    return [
+        pytest.param(
+            fault,
+            id=fault.name.removeprefix(PREFIX),
+            # Large images through the network, decoded in Python, leave no time for anything else.
+            marks=[pytest.mark.alone, without_cyclone] if fault is FROZEN else [],
+        )
+        for fault in PROCESS_FAULTS
+        if fault.outcome == outcome
+    ]
 
 
 def provoked(stage, folder, fault):

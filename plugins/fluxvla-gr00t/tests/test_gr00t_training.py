@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from fluxvla_gr00t.gr00t import GR00T
 
-from fluxvla_core import build_runner_from_cfg
-from fluxvla_core.operators import RunContext
 from fluxvla_core.testing.training import (
     TinyDataset,
+    assert_trained_alike,
     checkpoint_differences,
     run_ranks,
     tiny_config,
+    train,
 )
 from fluxvla_core.training.cost import fake, kept, kept_by_fake
 from tests.oracles import fill
@@ -44,7 +42,9 @@ RUNS = {
         {"freeze_vlm_backbone": False},
         {"enable_gradient_checkpointing": True},
     ),
+    "fsdp-n1.7": ("FSDPTrainRunner", "n1.7", {"freeze_vlm_backbone": False}, {}),
     "fsdp-n1.7-frozen": ("FSDPTrainRunner", "n1.7", {}, {}),
+    "ddp-n1.5": ("DDPTrainRunner", "n1.5", {"freeze_vlm_backbone": False}, {}),
     "ddp-n1.5-frozen": ("DDPTrainRunner", "n1.5", {}, {}),
     "ddp-n1.7": ("DDPTrainRunner", "n1.7", {"freeze_vlm_backbone": False}, {}),
 }
@@ -80,7 +80,9 @@ def run(name, kind, batch, work_dir, resume=None, head=None, **more):
     _, version, model, settings = RUNS[name]
     table = {
         "type": kind,
-        "max_steps": 3,
+        "max_steps": 20,
+        "save_iter_interval": 10,
+        "max_keep_ckpts": 0,
         "max_grad_norm": 1.0,
         "learning_rate": 1e-3,
         "collator": {"type": "DictCollator", "keys": list(KEYS)},
@@ -90,12 +92,8 @@ def run(name, kind, batch, work_dir, resume=None, head=None, **more):
     config = tiny_config(table, batch)
     tiny = MODELS[version]
     config["model"] = {**tiny, "vla_head": {**tiny["vla_head"], **(head or {})}, **model}
-    context = RunContext(config=config, section="runner", work_dir=Path(work_dir), resume=resume)
-    runner = build_runner_from_cfg(config["runner"], context)
-    dataset = Samples(version)
-    runner.run_setup(len(dataset))
-    runner.run(dataset)
-    return runner
+    run = {"config": config, "work_dir": work_dir, "resume": resume, "dataset": Samples(version)}
+    train(run)
 
 
 def every_run(work_dir):
@@ -111,24 +109,15 @@ def trained(tmp_path_factory):
     return work_dir
 
 
-def weights(work_dir):
-    from safetensors.torch import load_file
-
-    (file,) = sorted(Path(work_dir).glob("checkpoints/*/model.safetensors"))[-1:]
-    return load_file(file)
-
-
 @pytest.mark.parametrize("name", RUNS)
 def test_two_processes_train_as_one_does(trained, name, tmp_path):
     run(name, "OneProcessRunner", 4, tmp_path)
-    ours, theirs = weights(trained / name), weights(tmp_path)
-    assert ours.keys() == theirs.keys()
-    assert max(float((ours[n] - theirs[n]).abs().max()) for n in ours) < 1e-5
+    assert_trained_alike(trained / name, tmp_path)
 
 
 def test_it_goes_on_bit_for_bit_with_its_dropout(tmp_path):
     head = {"dropout": 0.2, "state_dropout": 0.3}
-    both = {"head": head, "save_iter_interval": 2, "max_keep_ckpts": 0, "max_steps": 4}
+    both = {"head": head, "save_iter_interval": 2, "max_steps": 4}
     run("fsdp-n1.5", "OneProcessRunner", 4, tmp_path / "whole", **both)
     first, last = sorted((tmp_path / "whole" / "checkpoints").glob("step-*"))
     run("fsdp-n1.5", "OneProcessRunner", 4, tmp_path / "on", resume=str(first), **both)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import ClassVar
 
 import numpy as np
@@ -10,10 +9,14 @@ import pytest
 import torch
 from fluxvla_smolvla.lerobot_files import published
 
-from fluxvla_core import build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import folders, latest
-from fluxvla_core.operators import RunContext
-from fluxvla_core.testing.training import checkpoint_differences, run_ranks
+from fluxvla_core.testing.training import (
+    assert_trained_alike,
+    checkpoint_differences,
+    losses,
+    run_ranks,
+    train,
+)
 from tests.training.held_memory import check_held
 
 from .tiny import ACTION, HORIZON, SIZES, STATE, WIDTH, lerobot_folder, published_weights
@@ -80,15 +83,8 @@ def config_of(runner, batch, model=None, **settings):
 def learn(work_dir, runner="OneProcessRunner", batch=4, resume=None, model=None, **settings):
     """One training; gives the work dir."""
     config = config_of(runner, batch, model, **settings)
-    context = RunContext(config=config, section="runner", work_dir=work_dir, resume=resume)
-    made = build_runner_from_cfg(config["runner"], context)
-    made.run_setup(10)
-    made.run(Samples())
+    train({"config": config, "work_dir": work_dir, "resume": resume, "dataset": Samples()})
     return work_dir
-
-
-def losses(work_dir):
-    return [json.loads(line)["loss"] for line in (work_dir / "metrics.jsonl").open()]
 
 
 def test_the_loss_falls_with_the_expert_alone(tmp_path):
@@ -112,13 +108,16 @@ PARTS = {
 }
 
 
+LONG = {"max_steps": 20, "save_iter_interval": 10, "max_keep_ckpts": 0}
+
+
 def on_two(work_dir):
     torch.distributed.init_process_group("gloo")
     mixed = {"model": PARTS["language"], "enable_mixed_precision_training": True}
     learn(work_dir / "bf16", "FSDPTrainRunner", batch=2, **mixed)
     for part, model in PARTS.items():
         for runner in ("DDPTrainRunner", "FSDPTrainRunner"):
-            learn(work_dir / f"{part}-{runner}", runner, batch=2, model=model)
+            learn(work_dir / f"{part}-{runner}", runner, batch=2, model=model, **LONG)
 
 
 @pytest.fixture(scope="module")
@@ -128,16 +127,15 @@ def two(tmp_path_factory):
     return place
 
 
+@pytest.fixture(scope="module", params=PARTS)
+def alone(request, tmp_path_factory):
+    place = tmp_path_factory.mktemp("alone") / request.param
+    return learn(place, model=PARTS[request.param], **LONG)
+
+
 @pytest.mark.parametrize("runner", ["DDPTrainRunner", "FSDPTrainRunner"])
-@pytest.mark.parametrize("part", PARTS)
-def test_two_processes_train_as_one_does(two, tmp_path, part, runner):
-    alone = learn(tmp_path, model=PARTS[part])
-    together = two / f"{part}-{runner}"
-    np.testing.assert_allclose(losses(together), losses(alone), rtol=1e-5)
-    ours, theirs = (latest(place).tensors("model.safetensors") for place in (together, alone))
-    assert ours.keys() == theirs.keys()
-    worst = max(ours, key=lambda name: float((ours[name] - theirs[name]).abs().max()))
-    assert float((ours[worst] - theirs[worst]).abs().max()) < 1e-5, worst
+def test_two_processes_train_as_one_does(two, alone, runner):
+    assert_trained_alike(two / f"{alone.name}-{runner}", alone)
 
 
 @pytest.mark.parametrize("part", PARTS)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
@@ -23,8 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
-from fluxvla_core.checkpoints.checkpoint import ENVIRONMENT, folders
-from fluxvla_core.checkpoints.manifest import NAME as MANIFEST
+from fluxvla_core.checkpoints.checkpoint import folders
 from fluxvla_core.checkpoints.writer import Disk
 from fluxvla_core.contracts.runner import SilentReporter
 from fluxvla_core.contracts.training import VLA
@@ -32,9 +30,14 @@ from fluxvla_core.data.loader import DictCollator
 from fluxvla_core.data.sampler import sample_rng
 from fluxvla_core.plugins.registry import RUNNERS, VLAS
 from fluxvla_core.spec import EmbodimentSpec, Joint
+from fluxvla_core.testing.comparisons import (
+    assert_trained_alike,
+    checkpoint_differences,
+    differences,
+    losses,
+)
 from fluxvla_core.training import stop
 from fluxvla_core.training.base_runner import BaseTrainRunner
-from fluxvla_core.training.metrics import WALL_CLOCK
 
 __all__ = [
     "ACTIONS",
@@ -44,8 +47,10 @@ __all__ = [
     "OneProcessRunner",
     "TinyDataset",
     "TinyVLA",
+    "assert_trained_alike",
     "checkpoint_differences",
     "differences",
+    "losses",
     "run_ranks",
     "tiny_config",
     "train",
@@ -236,7 +241,8 @@ def train(settings: Mapping[str, Any]) -> Any:
     """One training run in this process; gives the runner.
 
     Args:
-        settings: ``work_dir`` and ``config``; ``resume`` (None), ``length`` of the dataset (37),
+        settings: ``work_dir`` and ``config``; ``resume`` (None); ``dataset``, or the ``length``
+            (37) of a ``TinyDataset``;
             ``signal`` (rank, n, number): the rank sends itself signal ``number`` when it collates
             its n-th batch; ``kill_write`` n: SIGKILL before the n-th file operation of checkpoints;
             ``kill_forward`` (rank, n): the rank ends by SIGKILL before its n-th forward pass,
@@ -259,7 +265,7 @@ def train(settings: Mapping[str, Any]) -> Any:
     stop.NOTICE_S = settings.get("notice_s", stop.NOTICE_S)
     if settings.get("kill_write"):
         kill_at_operation(settings["kill_write"])
-    dataset = TinyDataset(settings.get("length", 37))
+    dataset = settings.get("dataset") or TinyDataset(settings.get("length", 37))
     with unflushed():
         runner = build_runner_from_cfg(table, context)
         runner.run_setup(len(dataset))
@@ -410,41 +416,3 @@ def _free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
-
-
-def differences(left: Path, right: Path) -> list[str]:
-    """Differences of two work dirs: checkpoint files whose bytes differ, and metric lines.
-
-    Compares all checkpoints, and ``metrics.jsonl`` without its wall-clock fields.
-    """
-    found = []
-    names = [[p.name for p in folders(d)] for d in (left, right)]
-    if names[0] != names[1]:
-        found.append(f"checkpoints: {names[0]} / {names[1]}")
-    for a, b in zip(folders(left), folders(right), strict=False):
-        found += checkpoint_differences(a, b)
-    records = [_records(d / "metrics.jsonl") for d in (left, right)]
-    if records[0] != records[1]:
-        found.append("metrics.jsonl")
-    return found
-
-
-def checkpoint_differences(left: Path, right: Path) -> list[str]:
-    """Names of files that differ between two checkpoints' folders.
-
-    Not compared are ``environment.json``, as packages may change between two runs, and the
-    manifest, which follows from the rest.
-    """
-    skipped = {Path(MANIFEST), Path(ENVIRONMENT)}
-    files = {p.relative_to(d) for d in (left, right) for p in d.rglob("*") if p.is_file()}
-    return [
-        f"{left.name}/{name}"
-        for name in sorted(files - skipped)
-        if len({(d / name).read_bytes() if (d / name).is_file() else None for d in (left, right)})
-        > 1
-    ]
-
-
-def _records(path: Path) -> list[dict[str, Any]]:
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    return [{k: v for k, v in row.items() if k not in WALL_CLOCK} for row in rows]

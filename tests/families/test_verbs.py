@@ -19,19 +19,10 @@ pytest.importorskip("fluxvla_sim")
 from fluxvla_core.cli.main import main
 from fluxvla_core.testing.training import checkpoint_differences
 
-from .tiny import CAMERAS, CONTINUES, HEIGHT, SHIPPED, WIDTH, tiny, weights
+from .tiny import CONTINUES, SHIPPED, tiny, weights
 
 QUICK = ("gr00t_n15", "llava", "diffusion")
 """Always run: a head of flow matching, one of queries, one of diffusion with two observations."""
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("data") / "aloha"
-    sizes = ["--height", str(HEIGHT), "--width", str(WIDTH)]
-    words = ["--tasks", "lift_hold", "--episodes", "2", "--workers", "1", "--cameras", *CAMERAS]
-    assert main(["collect", "aloha", "--out", str(out), *words, *sizes]) == 0
-    return out
 
 
 @pytest.mark.timeout(900)

@@ -95,7 +95,7 @@ def assert_trained_alike(
 
 def _weights(checkpoint: Path) -> dict[str, Any]:
     tensors = Checkpoint.open(checkpoint).tensors("model.safetensors")
-    return {name: tensor.float() for name, tensor in tensors.items()}
+    return {name: tensor.double() for name, tensor in tensors.items()}
 
 
 def _records(path: Path) -> list[dict[str, Any]]:

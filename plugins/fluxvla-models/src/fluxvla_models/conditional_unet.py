@@ -23,7 +23,9 @@ class StepEmbedding(nn.Module):
 
     def forward(self, timesteps: Tensor) -> Tensor:
         half = self.width // 2
-        index = torch.arange(half, device=timesteps.device, dtype=torch.float32)
+        # In float32 at least, and in float64 in a model that is.
+        dtype = torch.promote_types(torch.float32, torch.get_default_dtype())
+        index = torch.arange(half, device=timesteps.device, dtype=dtype)
         angles = timesteps[:, None] * torch.exp(index * -(math.log(10000.0) / (half - 1)))
         return torch.cat([angles.sin(), angles.cos()], dim=-1)
 

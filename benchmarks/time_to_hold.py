@@ -31,19 +31,23 @@ ALL = (*FAULTS, *PROCESS_FAULTS, *WHOLE_FAULTS)
 
 
 def played(stage: Callable[[Path], Stage], folder: Path, fault: Fault) -> Result:
-    """One fault; a machine that stalls stops the arm, rightly, before it is there."""
-    for attempt in range(4):
+    """One fault, as often as it needs to come about.
+
+    Raises:
+        AssertionError: it did not.
+    """
+    for attempt in range(fault.attempts):
         if fault in WHOLE_FAULTS:
             result = _whole_faults.play(folder / str(attempt), fault)
         elif fault in PROCESS_FAULTS:
             # Drivers that still know a killed process may keep their images from the next one.
-            with stage_crew() as fresh:
+            with stage_crew(fault.environment) as fresh:
                 result = _process_faults.play(fresh(folder / str(attempt)), fault)
         else:
             result = _robot_faults.play(stage(folder / str(attempt)), fault)
         if result.provoked:
-            break
-    return result
+            return result
+    raise AssertionError(f"{fault.name}: not provoked in {fault.attempts} attempts: {result.said}")
 
 
 def measured(fault: Fault, results: list[Result]) -> dict[str, Any]:

@@ -56,8 +56,8 @@ def of(outcome):
         pytest.param(
             fault,
             id=fault.name.removeprefix(PREFIX),
-            # Large images through the network, decoded in Python, leave no time for anything else.
-            marks=[pytest.mark.alone, without_cyclone] if fault is FROZEN else [],
+            # It takes luck, and therefore time.
+            marks=[pytest.mark.slow, without_cyclone] if fault is FROZEN else [],
         )
         for fault in PROCESS_FAULTS
         if fault.outcome == outcome
@@ -65,12 +65,15 @@ def of(outcome):
 
 
 def provoked(stage, folder, fault):
-    """A machine that stalls for a fifth of a second stops the arm, rightly, before the fault."""
-    for attempt in range(4):
-        result = play(stage(folder / str(attempt)), fault)
+    for attempt in range(fault.attempts):
+        if fault.environment:
+            with stage_crew(fault.environment) as make:
+                result = play(make(folder / str(attempt)), fault)
+        else:
+            result = play(stage(folder / str(attempt)), fault)
         if result.provoked:
             return result
-    pytest.fail(f"four times the run ended before the fault was there, at last: {result.said}")
+    pytest.fail(f"{fault.attempts} times it ended before the fault was there: {result.said}")
 
 
 @pytest.mark.parametrize("fault", of(STOP))

@@ -347,15 +347,6 @@ _FAULTS = [
         rule=MAIN,
     ),
     Fault("image callback spins for 5 s", order("image callback spins"), LOCKED, rule=MAIN),
-    Fault(
-        "image reception frozen (reliable images from Cyclone DDS)",
-        cyclone_images,
-        LOCKED,
-        around=cyclone_driver,
-        environment=FAST_DDS,
-        attempts=20,
-        exit_code=-signal.SIGKILL,
-    ),
     Fault("policy crashes (segmentation fault)", order("crash"), KILLED, exit_code=-signal.SIGSEGV),
     Fault(
         "policy uses all memory",
@@ -407,3 +398,13 @@ _FAULTS = [
     Fault("hook blocks for 5 s", order("hook blocks"), outcome=GOES_ON, exit_code=0),
 ]
 PROCESS_FAULTS = tuple(replace(fault, name=PREFIX + fault.name) for fault in _FAULTS)
+# Not in the table of docs/safety.md: it comes about by chance, and only on a busy machine.
+CYCLONE_FAULT = Fault(
+    f"{PREFIX}image reception frozen (reliable images from Cyclone DDS)",
+    cyclone_images,
+    LOCKED,
+    around=cyclone_driver,
+    environment=FAST_DDS,
+    attempts=20,
+    exit_code=-signal.SIGKILL,
+)

@@ -41,7 +41,7 @@ def played(stage: Callable[[Path], Stage], folder: Path, fault: Fault) -> Result
             result = _whole_faults.play(folder / str(attempt), fault)
         elif fault in PROCESS_FAULTS:
             # Drivers that still know a killed process may keep their images from the next one.
-            with stage_crew(fault.environment) as fresh:
+            with stage_crew() as fresh:
                 result = _process_faults.play(fresh(folder / str(attempt)), fault)
         else:
             result = _robot_faults.play(stage(folder / str(attempt)), fault)

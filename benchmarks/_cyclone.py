@@ -1,4 +1,4 @@
-"""Starts a camera driver on Cyclone DDS (``_cyclone_camera``), and lets Fast DDS hear it."""
+"""Starts a camera driver on Cyclone DDS (``_cyclone_camera``) that Fast DDS can receive from."""
 
 from __future__ import annotations
 
@@ -20,23 +20,10 @@ CYCLONE = """
   </Discovery>
 </Domain></CycloneDDS>
 """
-# Fast DDS 3 does not match a writer that has no type object, unless it propagates none itself.
-FAST_DDS = """<?xml version="1.0" encoding="UTF-8" ?>
-<dds xmlns="http://www.eprosima.com"><profiles>
-  <participant profile_name="without_type_propagation" is_default_profile="true"><rtps>
-    <propertiesPolicy><properties><property>
-      <name>fastdds.type_propagation</name><value>disabled</value>
-    </property></properties></propertiesPolicy>
-  </rtps></participant>
-</profiles></dds>
-"""
-
-
-def fast_dds_environment(folder: Path) -> dict[str, str]:
-    """What a process with Fast DDS needs so that it receives these images."""
-    profile = folder / "without_type_propagation.xml"
-    profile.write_text(FAST_DDS, encoding="utf-8")
-    return {"FASTDDS_DEFAULT_PROFILES_FILE": str(profile)}
+# Fast DDS 3 matches a writer without type information only if it propagates none itself.
+FAST_DDS = {
+    "FASTDDS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_name("_fastdds_without_types.xml"))
+}
 
 
 class CycloneCamera:

@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._cyclone import CycloneCamera, fast_dds_environment
-from benchmarks._process_program import BLOCKED_S, PROVOKED, SENT, FullSizeArm
+from benchmarks._cyclone import FAST_DDS, CycloneCamera
+from benchmarks._process_program import BLOCKED_S, PATIENCE_S, PROVOKED, SENT, FullSizeArm
 from benchmarks._robot_faults import (
     ARM,
     CAMERAS,
@@ -56,7 +56,7 @@ CONFIG = """
 hooks = ["BlockingHook"]
 inference = dict(
     type="ProgramRunner", task_descriptions={{"1": "swing"}}, async_execution=True,
-    record_fps=None, max_publish_step={steps}, control_process=True,
+    record_fps=None, max_publish_step={steps}, control_process=True, safety={safety},
     operator=dict(type={arm!r}, folder={folder!r}),
     policy=dict(type="HarmfulSwing", folder={folder!r}, orders={orders}))
 """
@@ -80,7 +80,9 @@ class Program:
         (folder / "program.py").write_text(plugin)
         reads, writes = os.pipe()
         self._orders = os.fdopen(writes, "w", encoding="utf-8", buffering=1)
-        config = CONFIG.format(steps=steps, folder=str(folder), orders=reads, arm=stage.arm)
+        config = CONFIG.format(
+            steps=steps, folder=str(folder), orders=reads, arm=stage.arm, safety=stage.safety
+        )
         (folder / "cfg.py").write_text(config)
         line = ["run", "--config", folder / "cfg.py", "--plugin", folder / "program.py"]
         line += ["--work-dir", folder, *words]
@@ -94,7 +96,6 @@ class Program:
             cwd=ROOT,
             env={
                 **os.environ,
-                **stage.environment,
                 "OMP_NUM_THREADS": "1",
                 "TERM": "dumb",
                 name: value,
@@ -292,7 +293,7 @@ def pause(running: Program) -> None:
 def cyclone_driver(stage: Stage) -> CycloneCamera:
     """Before the run: cameras of 640x480 and a second driver of theirs, on Cyclone DDS."""
     stage.arm = FullSizeArm.__name__
-    stage.environment = fast_dds_environment(stage.folder)
+    stage.safety = {"max_age_s": PATIENCE_S, "max_skew_s": PATIENCE_S, "starvation_s": PATIENCE_S}
     stage.robot.tell(change={topic: {"height": 480, "width": 640, "hz": 10} for topic in CAMERAS})
     camera = CycloneCamera(*CAMERAS, height=480, width=640, hz=30)
     stage.more.append(camera)
@@ -300,9 +301,13 @@ def cyclone_driver(stage: Stage) -> CycloneCamera:
 
 
 def cyclone_images(running: Program) -> bool:
-    """When pieces of an image from Cyclone DDS are lost, Fast DDS spins in ``rcl_take`` and keeps
-    the GIL; only SIGKILL ends that process. A starved machine may stop the arm before."""
-    running.order("note the time")
+    """While the main process has little time, Fast DDS soon spins in ``rcl_take`` on an image of
+    Cyclone's and keeps the GIL; only SIGKILL ends that process.
+
+    Returns:
+        Whether it froze: a machine that has even less time stops the arm before.
+    """
+    running.order("compete for the processors")
     (camera,) = running.stage.more
     camera.start()
     running.wait_for(running.at_rest, "freezing", END_S)
@@ -342,13 +347,6 @@ _FAULTS = [
         rule=MAIN,
     ),
     Fault("image callback spins for 5 s", order("image callback spins"), LOCKED, rule=MAIN),
-    Fault(
-        "image reception frozen (reliable images from Cyclone DDS)",
-        cyclone_images,
-        LOCKED,
-        around=cyclone_driver,
-        exit_code=-signal.SIGKILL,
-    ),
     Fault("policy crashes (segmentation fault)", order("crash"), KILLED, exit_code=-signal.SIGSEGV),
     Fault(
         "policy uses all memory",
@@ -400,3 +398,13 @@ _FAULTS = [
     Fault("hook blocks for 5 s", order("hook blocks"), outcome=GOES_ON, exit_code=0),
 ]
 PROCESS_FAULTS = tuple(replace(fault, name=PREFIX + fault.name) for fault in _FAULTS)
+# Not in the table of docs/safety.md: it comes about by chance, and only on a busy machine.
+CYCLONE_FAULT = Fault(
+    f"{PREFIX}image reception frozen (reliable images from Cyclone DDS)",
+    cyclone_images,
+    LOCKED,
+    around=cyclone_driver,
+    environment=FAST_DDS,
+    attempts=20,
+    exit_code=-signal.SIGKILL,
+)

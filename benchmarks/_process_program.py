@@ -11,6 +11,7 @@ import ctypes
 import logging
 import os
 import resource
+import subprocess
 import sys
 import threading
 import time
@@ -37,6 +38,8 @@ FLOOD_BYTES = (100_000, 10_000, 1000, 100, 1)
 DRIVER = logging.getLogger("driver")
 
 
+COMPETITORS = 3
+PATIENCE_S = 10.0
 FULL_SIZE = replace(ARM, cameras=tuple(replace(c, height=480, width=640) for c in ARM.cameras))
 
 
@@ -49,8 +52,8 @@ class ProgramRunner(BaseInferenceRunner):
 class ProgramArm(BenchArm):
     """Stores every command that it sends, and writes long warnings while ``FLOOD`` is there."""
 
-    def __init__(self, folder: str) -> None:
-        super().__init__()
+    def __init__(self, folder: str, **settings: float) -> None:
+        super().__init__(**settings)
         self._flood = Path(folder) / FLOOD
         # Without a buffer: what was sent before a kill is there.
         self._file = open(Path(folder) / SENT, "ab", buffering=0)  # noqa: SIM115
@@ -65,9 +68,12 @@ class ProgramArm(BenchArm):
 
 @OPERATORS.register_module()
 class FullSizeArm(ProgramArm):
-    """Its images have the size of a usual camera's: more than a packet."""
+    """Its images have the size of a usual camera's, more than a packet, and may be late."""
 
     embodiment = FULL_SIZE
+
+    def __init__(self, folder: str) -> None:
+        super().__init__(folder, max_age_s=PATIENCE_S, max_skew_s=PATIENCE_S)
 
 
 @OPERATORS.register_module()
@@ -229,9 +235,16 @@ def stand_in_for_a_link_whose_thread_ends(policy: HarmfulSwing) -> None:
     Link.receive = receive  # type: ignore[method-assign]
 
 
-def note_the_time(policy: HarmfulSwing) -> None:
-    """Until this process runs no Python any more: what is stored then is when that began."""
+def compete_for_the_processors(policy: HarmfulSwing) -> None:
+    """Processes of this one's session compute, which leave it a small part of the processors.
+
+    What is stored from then on is the last moment at which this process ran Python.
+    """
     file = os.open(policy.folder / PROVOKED, os.O_CREAT | os.O_WRONLY)
+    until = time.monotonic() + 3 * BLOCKED_S
+    busy = f"import time\nwhile time.monotonic() < {until}: pass"
+    for _ in range(COMPETITORS):
+        subprocess.Popen([sys.executable, "-c", busy], env={})
 
     def note() -> None:
         while True:
@@ -260,7 +273,7 @@ HARMS: Mapping[str, Callable[[HarmfulSwing], None]] = {
     "image callback spins": stand_in_for_an_image_callback_that_spins,
     "link is not read": stand_in_for_a_link_that_is_not_read,
     "hook blocks": block_a_hook,
-    "note the time": note_the_time,
+    "compete for the processors": compete_for_the_processors,
     "link's thread ends": stand_in_for_a_link_whose_thread_ends,
     "get_frame blocks": in_get_frame(BLOCK),
     "get_frame keeps the interpreter": in_get_frame(KEEP),

@@ -77,8 +77,10 @@ class BenchArm(RosOperator):
 
     embodiment = ARM
 
-    def __init__(self, state_topic: str = STATE, domain_id: int | None = None) -> None:
-        super().__init__(domain_id, connect_timeout_s=20.0, rate_window_s=0.0)
+    def __init__(
+        self, state_topic: str = STATE, domain_id: int | None = None, **settings: float
+    ) -> None:
+        super().__init__(domain_id, connect_timeout_s=20.0, rate_window_s=0.0, **settings)
         self.state_topic = state_topic
         self.sent: list[list[float]] = []
 
@@ -149,7 +151,7 @@ class Stage:
     most: int = 1000
     # What a program of its own drives.
     arm: str = "ProgramArm"
-    environment: Mapping[str, str] = field(default_factory=dict)
+    safety: Mapping[str, float] = field(default_factory=dict)
     more: list[Any] = field(default_factory=list)
 
     def runner(self) -> BaseInferenceRunner:
@@ -182,6 +184,9 @@ class Fault:
         provoke: called with the stage (or the ``Program`` of two processes) once the arm moves;
             before the run for what is ``REFUSED``. False if it did not come about.
         around: called with the stage before the run, which is inside of the context.
+        environment: of all processes; such a fault has a crew of its own.
+        attempts: how often it is tried until it comes about: a machine that stalls stops the arm,
+            rightly, before.
         says: what the one line that names the cause contains, a regular expression.
         outcome: ``STOP``, ``REFUSED`` or ``GOES_ON``.
         exit_code: of the program.
@@ -198,6 +203,8 @@ class Fault:
     exit_code: int = 1
     rule: str | None = None
     around: Callable[[Stage], AbstractContextManager[object]] = nullcontext
+    environment: Mapping[str, str] = field(default_factory=dict)
+    attempts: int = 4
     after: Callable[[Stage], object] | None = None
     braked: bool = True
 
@@ -236,13 +243,14 @@ class Result:
 
 
 @contextmanager
-def stage_crew() -> Iterator[Callable[[Path], Stage]]:
+def stage_crew(environment: Mapping[str, str] | None = None) -> Iterator[Callable[[Path], Stage]]:
     """A domain, the arm's process and the listener; call it with a folder for each fault."""
     with claimed_domain() as domain, claimed_domain() as empty:
         before = dict(os.environ)
         os.environ.update(
             ROS_DOMAIN_ID=str(domain),
             ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
+            **(environment or {}),
         )
         crew: list[Driver] = []
         try:

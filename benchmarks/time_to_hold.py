@@ -31,8 +31,12 @@ ALL = (*FAULTS, *PROCESS_FAULTS, *WHOLE_FAULTS)
 
 
 def played(stage: Callable[[Path], Stage], folder: Path, fault: Fault) -> Result:
-    """One fault; a machine that stalls stops the arm, rightly, before it is there."""
-    for attempt in range(4):
+    """One fault, as often as it needs to come about.
+
+    Raises:
+        AssertionError: it did not.
+    """
+    for attempt in range(fault.attempts):
         if fault in WHOLE_FAULTS:
             result = _whole_faults.play(folder / str(attempt), fault)
         elif fault in PROCESS_FAULTS:
@@ -42,8 +46,8 @@ def played(stage: Callable[[Path], Stage], folder: Path, fault: Fault) -> Result
         else:
             result = _robot_faults.play(stage(folder / str(attempt)), fault)
         if result.provoked:
-            break
-    return result
+            return result
+    raise AssertionError(f"{fault.name}: not provoked in {fault.attempts} attempts: {result.said}")
 
 
 def measured(fault: Fault, results: list[Result]) -> dict[str, Any]:

@@ -160,7 +160,7 @@ def test_shapes_of_a_dataset_that_is_there(
 @pytest.mark.parametrize(
     ("model", "runner", "said"),
     [
-        (", mood='looks at weights'", "", "the model cannot be built without memory: "),
+        (", mood='looks at weights'", "", "the model cannot be built on the meta device: "),
         (", mood='looks at inputs'", "", "activations are not known: DataDependentOutput"),
         (", state_dim=4", "", "activations are not known: "),
         ("", ", lora=dict(rank=2, target_modules=['nowhere'])", "adapters cannot be put into"),

@@ -142,7 +142,7 @@ KILLED = """1 of 2 ranks were killed, or had not begun, when they were to stop a
 @pytest.mark.parametrize(
     ("number", "code", "prefix", "left"),
     [
-        (signal.SIGINT, 130, "interrupted: ", "the newest whole checkpoint is {}"),
+        (signal.SIGINT, 130, "interrupted: ", "the newest checkpoint is {}"),
         (signal.SIGTERM, 1, "", "there is no checkpoint yet"),
     ],
 )

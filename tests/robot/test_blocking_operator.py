@@ -105,7 +105,7 @@ def test_a_process_that_stood_still_blames_neither_the_policy_nor_a_stream(bench
         return frame
 
     bench.arm.get_frame = paused
-    error = fails(bench, SafetyStop, "is stale: .*; this machine let the program stand still for")
+    error = fails(bench, SafetyStop, "is stale: .*; this machine did not run this process for")
     assert "the process was paused" in error.cause
 
 

@@ -163,7 +163,11 @@ def local_arm():
     ("operator", "cls", "why"),
     [
         ({"type": "Arm"}, OwnObservation, "OwnObservation reads the robot by a method of its own"),
-        ({"type": "Recorded"}, BaseInferenceRunner, "Recorded follows no commands"),
+        (
+            {"type": "Recorded"},
+            BaseInferenceRunner,
+            "Recorded is a recording, which",
+        ),
         ({"type": "OwnClock"}, BaseInferenceRunner, "OwnClock .* has a clock of its own"),
         ({"type": "Connecting"}, BaseInferenceRunner, "Connecting connects in its constructor"),
         (DividedArm(), BaseInferenceRunner, "DividedArm is an object, not a table"),

@@ -11,7 +11,7 @@ import pytest
 
 from fluxvla_core.control.interrupt import Interrupted, Interrupts
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.robot.inference import PolicyThread
+from fluxvla_core.robot.local_policy_client import PolicyThread
 
 
 def test_jobs_run_in_order_in_one_other_thread():

@@ -47,7 +47,7 @@ PAUSED, KILLED, STOPPED = signal.SIGSTOP, signal.SIGKILL, signal.SIGTERM
 EXIT_CODES = {PAUSED: 1, KILLED: -signal.SIGKILL, STOPPED: 1}
 START_S, END_S = 120.0, 60.0
 # A machine that stalls: this program, its main process, or the driver.
-STALLED = re.compile(r"program stand still for|main process did not run for|is silent for")
+STALLED = re.compile(r"did not run this process for|main process did not run for|is silent for")
 
 
 @pytest.fixture

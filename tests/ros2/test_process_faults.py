@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks._process_faults import (
+    CYCLONE_FAULT,
     END_S,
     PREFIX,
     PROCESS_FAULTS,
@@ -38,10 +39,6 @@ OPERATORS.unregister("ProgramArm")
 class ProgramArm(program.ProgramArm):
     pass
 """
-(FROZEN,) = (fault for fault in PROCESS_FAULTS if "Cyclone" in fault.name)
-without_cyclone = pytest.mark.skipif(
-    find_spec("cyclonedds") is None, reason="Cyclone DDS has no wheel for this Python"
-)
 QUESTION = "task id or instruction (empty ends):"
 
 
@@ -52,25 +49,16 @@ def stage(ros_domain):
 
 
 def of(outcome):
-    return [
-        pytest.param(
-            fault,
-            id=fault.name.removeprefix(PREFIX),
-            # Large images through the network, decoded in Python, leave no time for anything else.
-            marks=[pytest.mark.alone, without_cyclone] if fault is FROZEN else [],
-        )
-        for fault in PROCESS_FAULTS
-        if fault.outcome == outcome
-    ]
+    faults = [fault for fault in PROCESS_FAULTS if fault.outcome == outcome]
+    return [pytest.param(fault, id=fault.name.removeprefix(PREFIX)) for fault in faults]
 
 
 def provoked(stage, folder, fault):
-    """A machine that stalls for a fifth of a second stops the arm, rightly, before the fault."""
-    for attempt in range(4):
+    for attempt in range(fault.attempts):
         result = play(stage(folder / str(attempt)), fault)
         if result.provoked:
             return result
-    pytest.fail(f"four times the run ended before the fault was there, at last: {result.said}")
+    pytest.fail(f"{fault.attempts} times it ended before the fault was there: {result.said}")
 
 
 @pytest.mark.parametrize("fault", of(STOP))
@@ -87,6 +75,17 @@ def test_the_arm_is_stopped_and_the_cause_is_named(stage, tmp_path, fault):
     rules = [trip["rule"] for trip in result.record["trips"]]
     assert rules == ([] if fault.interrupts else [fault.rule])
     assert fault.interrupts or result.record["problem"].strip() in result.said
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("cyclonedds") is None, reason="no wheel of Cyclone DDS")
+def test_the_arm_is_held_while_images_from_another_dds_freeze_the_main_process(tmp_path):
+    with stage_crew(CYCLONE_FAULT.environment) as own_stage:
+        result = provoked(own_stage, tmp_path, CYCLONE_FAULT)
+
+    assert CYCLONE_FAULT.matches(result.said), result.said
+    assert result.exit_code == CYCLONE_FAULT.exit_code
+    assert result.hold_s is not None
 
 
 @pytest.mark.parametrize("fault", of(GOES_ON))

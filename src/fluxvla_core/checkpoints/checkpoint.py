@@ -286,8 +286,8 @@ def refuse_existing(work_dir: Path) -> None:
 def latest(place: str | Path) -> Checkpoint | None:
     """The newest checkpoint of a work dir, None when there is none yet.
 
-    Only its manifest is read. What loads a policy or resumes uses :func:`newest_whole`, which
-    verifies every file and passes over a damaged checkpoint.
+    Only its manifest is read. Loading a policy and ``--resume auto`` use :func:`newest_whole`,
+    which verifies every file and passes over a damaged checkpoint.
 
     Raises:
         CheckpointError: the newest one's manifest is damaged; the one before it is offered.

@@ -57,7 +57,7 @@ def outline(plan: Plan, log_format: str, nproc: int | None) -> tuple[str, FluxEr
 
 
 def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
-    """The training, built without memory; or a line that says why it cannot be."""
+    """The training, built on the meta device; or a line that says why it cannot be."""
     from fluxvla_core.build import RunContext
     from fluxvla_core.cli.reporters import heartbeat
     from fluxvla_core.config.tree import freeze
@@ -74,7 +74,7 @@ def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
         config_file=plan.config.file,
         nproc=nproc or 1,
     )
-    with heartbeat("putting the training together without memory"):
+    with heartbeat("building the training on the meta device"):
         return rehearse(context, PROCESSES if nproc is None else (nproc,))
 
 

@@ -167,9 +167,9 @@ def _unsaved(silent: int, nproc: int, work_dir: Path, grace: int) -> RunFailed |
 
     if not silent:
         return None
-    # A checkpoint has its name only when it is whole; summing it up again would take long.
+    # A checkpoint gets its name when it is complete; verifying its hashes would take long.
     found = folders(work_dir)
-    left = f"the newest whole checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
+    left = f"the newest checkpoint is {found[-1]}" if found else "there is no checkpoint yet"
     return RunFailed(
         f"{silent} of {nproc} ranks were killed, or had not begun, when they were to stop and save",
         cause=f"saving took longer than --grace {grace} (seconds)",

@@ -55,7 +55,9 @@ class TrainRunner(Contract):
 
 
 class Hook(Contract):
-    """Observer of a run: overrides the methods that it wants to be called by. None may act.
+    """Observer of a run: overrides the methods that it wants to be called by.
+
+    It must not change the run.
 
     A method may take any subset of its arguments, by name. A hook is active only where a config
     names it (``hooks = [dict(type="LatencyLog", every=10)]``): installing a package never changes

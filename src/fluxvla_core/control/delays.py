@@ -39,8 +39,8 @@ POLICY = DelaySource(
 )
 MACHINE = DelaySource(
     "this machine",
-    "the process was paused, other programs took the processors, or native code held the GIL: "
-    "neither the robot nor the policy had a chance",
+    "the process was paused, other programs took the processors, or native code held the GIL; "
+    "the robot and the policy were not asked meanwhile",
     "lighten the load of this machine, or give this process a higher priority",
 )
 

@@ -109,7 +109,7 @@ class PolicyClient(ABC):
 
     @abstractmethod
     def refused(self, answer: Answer) -> None:
-        """Called with an answer whose chunk is no motion for this arm."""
+        """Called with an answer whose chunk was refused: not finite, a wrong shape, or a jump."""
 
     @abstractmethod
     def slowest_since(self, since: float) -> tuple[DelaySource, float]:

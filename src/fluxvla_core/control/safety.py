@@ -135,7 +135,7 @@ class BadTiming(RuleStop):
 
 
 class BadChunk(RuleStop):
-    """A policy's answer is no motion for this arm."""
+    """A policy's chunk is refused: not finite, of a wrong shape, or it jumps."""
 
     rule = Rule.CHUNK
 

@@ -28,7 +28,7 @@ from fluxvla_core.robot.events import EpisodeObserver
 from fluxvla_core.robot.tasks import REARM, Task, TaskSource, tasks
 
 if TYPE_CHECKING:
-    from fluxvla_core.robot.inference import PolicyThread
+    from fluxvla_core.robot.local_policy_client import PolicyThread
 
 _POLL_S = 0.02
 # How long a policy's answer may take that nobody waits for any more.

@@ -321,7 +321,7 @@ class Episode:
         recent = time.monotonic() - _RECENT * self._settings.safety.max_age_s
         seconds = self._robot.delays.stood_still(recent)
         if seconds > 0.0:
-            error.what += f"; {MACHINE.name} let the program stand still for {seconds:.2f} s"
+            error.what += f"; {MACHINE.name} did not run this process for {seconds:.2f} s"
             error.cause, error.next = MACHINE.cause, MACHINE.next
 
     def _rule(self, error: BaseException) -> str:

@@ -74,13 +74,14 @@ class InferenceOptions:
     max_publish_step: int = 10000
     """commands after which an episode ends."""
     action_chunk: int | None = None
-    """how many of a chunk's actions may be used; all by default."""
+    """how many of a chunk's actions may be used; all by default. An upper bound of
+    ``execute_horizon``."""
     execute_horizon: int | None = None
     """how many actions of a chunk are executed before the next is asked for. By default all of
     them; while chunks are joined in motion, as few as the policy is quick enough for (one, in a
     simulation whose time stands still meanwhile)."""
     async_execution: bool = False
-    """think while moving: short for ``chunk_joining="latest_only"``."""
+    """run inference while the arm moves: short for ``chunk_joining="latest_only"``."""
     chunk_joining: str | Mapping[str, Any] | None = None
     """how chunks become one motion: a name of ``METHODS`` in ``control.joiners``, or a table
     with ``method = '<name>'`` and its parameters. ``synchronous`` by default."""

@@ -217,7 +217,7 @@ def _why_single_process(robot: Robot, operator: Operator) -> str | None:
     """Why an operator that cannot be divided does not run as a whole in another process."""
     name = robot.name
     if not robot.follows_commands:
-        return f"{name} follows no commands"
+        return f"{name} is a recording, which does not execute commands"
     if not isinstance(robot.clock, MonotonicClock):
         return f"{name} cannot be divided, and has a clock of its own"
     if not implements(operator, Operator, "connect"):

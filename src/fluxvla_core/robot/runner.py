@@ -38,7 +38,7 @@ from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.robot.engine import Engine, LocalEngine, RobotSession, RunHistory
 from fluxvla_core.robot.episode import EpisodeParts, EpisodeSettings
 from fluxvla_core.robot.events import Event, HookObserver
-from fluxvla_core.robot.inference import LocalPolicyClient, PolicyThread
+from fluxvla_core.robot.local_policy_client import LocalPolicyClient, PolicyThread
 from fluxvla_core.robot.observations import ObservationReader
 from fluxvla_core.robot.options import (
     InferenceOptions,

@@ -1,4 +1,4 @@
-"""What a training costs: memory and operations, counted on a model without memory; peak memory.
+"""What a training costs: memory and operations, counted on the meta device; peak memory.
 
 The model is built on torch's meta device, and runs its forward pass with fake tensors, which have
 shapes and dtypes only: a model of seven billion parameters is counted on a laptop. Weights,
@@ -381,7 +381,7 @@ class Meter:
     def count(self, arguments: Mapping[str, Any]) -> str | None:
         """Count with the arguments of one batch; why that cannot be done, None if it can.
 
-        A model that decides by the values of its inputs cannot run without memory.
+        A model that decides by the values of its inputs cannot run on the meta device.
         """
         skeleton, self._skeleton = self._skeleton, None
         if skeleton is None:

@@ -132,7 +132,7 @@ def autocast(device: torch.device, dtype: torch.dtype | None) -> AbstractContext
     return torch.autocast(device.type, dtype)
 
 
-# -- without memory --------------------------------------------------------------------------
+# -- on the meta device ----------------------------------------------------------------------
 
 
 def has_values(tensor: Tensor) -> bool:
@@ -153,7 +153,7 @@ _FOLLOW: ContextVar[bool] = ContextVar("weights_follow", default=False)
 
 
 def weights_follow() -> bool:
-    """Whether the model that is built now gets a checkpoint's weights, or is without memory.
+    """Whether the model that is built now gets a checkpoint's weights, or is on the meta device.
 
     Weights that it would start a training from need not be read then, nor be there.
     """
@@ -331,7 +331,7 @@ def replicated_layout(model: nn.Module) -> Layout:
 
 
 def bare(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """A tensor without memory."""
+    """A tensor without storage."""
     return torch.empty(tuple(shape), dtype=dtype, device="meta")
 
 

@@ -58,7 +58,7 @@ class Rehearsal:
         memory: number of processes -> what each of them needs.
         precision: dtype that is computed in.
         notes: missing knowledge, and parts that do not fit together.
-        skeleton: the model without memory, with its adapters.
+        skeleton: the model on the meta device, with its adapters.
         inputs: the batch itself.
         refused: the error that would end the training at its first batch.
     """
@@ -89,7 +89,7 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
     rehearsal = Rehearsal()
     notes = rehearsal.notes
     rehearsal.robot = _tried(notes, "the robot is not known", lambda: robot_of(context.config))
-    what = "the model cannot be built without memory"
+    what = "the model cannot be built on the meta device"
     model = _tried(notes, what, lambda: on_meta(context))
     runner = _runner(context, notes)
     if model is not None:
@@ -121,7 +121,7 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
 
 
 def on_meta(context: RunContext) -> nn.Module:
-    """The config's ``model`` without memory.
+    """The config's ``model`` on the meta device.
 
     Raises:
         Exception: what its class raises.

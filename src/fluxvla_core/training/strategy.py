@@ -162,7 +162,10 @@ class Strategy(TrainRunner):
         return norm
 
     def before_first_step(self, batch: dict[str, Any]) -> None:
-        """Called with the first batch, before the first step; must leave no trace."""
+        """Called with the first batch, before the first step.
+
+        It must not change weights, buffers, gradients or random states.
+        """
         if type(self).warm_up is not Strategy.warm_up:
             message = f"{type(self).__name__}.warm_up is deprecated, call it before_first_step"
             warnings.warn(message, DeprecationWarning, stacklevel=2)

@@ -25,7 +25,6 @@ from fluxvla_models.lerobot_files import (
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import CheckpointFormat, ForeignCheckpoint, safetensors_in
 from fluxvla_core.results import read_json
-from fluxvla_gr00t.lerobot_write import write
 from fluxvla_gr00t.robots import GRIPPER, Robot, fewer_cameras, flat_robot, grouped_robot
 from fluxvla_gr00t.tables import (
     checkpoint,
@@ -177,6 +176,9 @@ class LeRobotGR00TFormat(CheckpointFormat):
             CheckpointError: its sizes are not the published ones, or LeRobot's processors cannot
                 do what its transforms do.
         """
+        # Here: it imports transformers, and every import of any checkpoint loads this module.
+        from fluxvla_gr00t.lerobot_write import write
+
         write(checkpoint, folder, HEADS)
 
 

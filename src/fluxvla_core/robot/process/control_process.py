@@ -18,8 +18,8 @@ from fluxvla_core.errors import RunFailed, SafetyStop
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.frames import FrameMemory
 from fluxvla_core.robot.process.link import Link, make_memory
+from fluxvla_core.robot.process.link_server import LinkServer
 from fluxvla_core.robot.process.messages import Kind, Message
-from fluxvla_core.robot.process.query_server import LinkServer
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
 from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot

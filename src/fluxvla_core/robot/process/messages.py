@@ -92,7 +92,7 @@ class Kind(str, Enum):
     ACCEPTED = "accepted"
     """The chunk of ANSWER ``number`` is executed."""
     REFUSED = "refused"
-    """The chunk of ANSWER ``number`` is no motion for this arm."""
+    """The chunk of ANSWER ``number`` is refused: not finite, of a wrong shape, or it jumps."""
     LATE = "late"
     """What took longest ``since`` a time; REPLY has ``name``, ``cause``, ``next``, ``seconds``."""
 

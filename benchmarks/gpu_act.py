@@ -36,7 +36,6 @@ from fluxvla_core.policies import benchmark
 from fluxvla_core.policies.execution import (
     EXECUTIONS,
     Eager,
-    Execution,
     Transfer,
     clock_of,
     execution_of,
@@ -95,7 +94,7 @@ def measure(case: Case, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def timed(
-    execution: Execution, batches: Sequence[Mapping[str, torch.Tensor]], args: argparse.Namespace
+    execution: Eager, batches: Sequence[Mapping[str, torch.Tensor]], args: argparse.Namespace
 ) -> tuple[dict[str, Any], Any]:
     """Percentiles in ms by part, memory and the first call; and the answers to ``batches``."""
     transfer = Transfer(args.device)

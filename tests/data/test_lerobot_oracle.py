@@ -274,11 +274,10 @@ def test_a_dataset_that_lerobot_recorded_trains(seen, tmp_path, spec):
     assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
     policy = load_policy(work)
     sample = ParquetDataset(str(root), [], CAMERAS)[0]
-    images = [image.transpose(1, 2, 0) for image in sample["images"]]
     chunk = policy.predict_action(
         {
             "qpos": sample["states"],
-            "images": dict(zip(CAMERAS, images, strict=True)),
+            "images": {c.name: np.zeros((c.height, c.width, 3), np.uint8) for c in spec().cameras},
             "task_description": sample["task_description"],
         }
     )

@@ -28,7 +28,7 @@ from fluxvla_core.evaluation import (
     TaskSpec,
     make_policy,
     match_policy,
-    rollout,
+    worker,
 )
 from fluxvla_core.evaluation.worker import EpisodeWorker, Settings
 from fluxvla_core.operators import Camera, EmbodimentSpec
@@ -189,7 +189,7 @@ def test_it_is_refused_before_a_scene_is_built(
         made.append(build_environment_from_cfg(table))
         return made[0]
 
-    monkeypatch.setattr(rollout, "build_environment_from_cfg", build)
+    monkeypatch.setattr(worker, "build_environment_from_cfg", build)
     path = save(tmp_path / "work", **arguments)
     table = {"type": "LiberoEnvironment", "cameras": tuple(CAMERAS)}
     with pytest.raises(SpecMismatch) as caught:

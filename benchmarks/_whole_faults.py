@@ -8,8 +8,8 @@ received which command. No middleware takes part.
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +29,12 @@ class WholeStage:
     Args:
         folder: of the program.
         arm: the operator's class.
+        safety: of its runner.
     """
 
     folder: Path
     arm: str = "WholeArm"
+    safety: Mapping[str, float] = field(default_factory=dict)
 
     def commands(self) -> Sequence[tuple[float, list[float]]]:
         """When the arm received each command, and the positions in it."""

@@ -88,7 +88,7 @@ def build_from_cfg(
         return cfg
     arguments = {**defaults, **cfg}
     name = arguments.pop("type", None)
-    cls = _class_of(name, registry)
+    cls = class_of(name, registry)
     taken = parameters(cls)
     for key in INJECTED:
         if key in cfg and context is not None:
@@ -148,7 +148,7 @@ def takes(cfg: Any, registry: Registry, name: str) -> bool:
         ConfigError: no ``type``.
         PluginError: the class cannot be loaded.
     """
-    return isinstance(cfg, Mapping) and name in parameters(_class_of(cfg.get("type"), registry))
+    return isinstance(cfg, Mapping) and name in parameters(class_of(cfg.get("type"), registry))
 
 
 def parameters(cls: type) -> set[str]:
@@ -203,14 +203,20 @@ def robot_of(config: Mapping[str, Any]) -> EmbodimentSpec | None:
         finally:
             operator.close()
     for table in tables:
-        described = getattr(_class_of(table.get("type"), BY_NAME["runners"]), "robot_spec", None)
+        described = getattr(class_of(table.get("type"), BY_NAME["runners"]), "robot_spec", None)
         if described is not None:
             robot: EmbodimentSpec = described()
             return robot
     return None
 
 
-def _class_of(name: Any, registry: Registry) -> type:
+def class_of(name: Any, registry: Registry) -> type:
+    """The class that the ``type`` of a table of ``registry`` names.
+
+    Raises:
+        ConfigError: it is neither a name nor a class.
+        PluginError: the class cannot be loaded.
+    """
     if inspect.isclass(name):
         return name
     if isinstance(name, str):

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fluxvla_core.contracts.frame import Observation as Observation
     from fluxvla_core.contracts.policy import Policy as Policy
     from fluxvla_core.contracts.training import VLA as VLA
+    from fluxvla_core.contracts.training import InputSizes as InputSizes
     from fluxvla_core.contracts.training import PartWeights as PartWeights
     from fluxvla_core.data.pretrained import model_folder as model_folder
     from fluxvla_core.data.pretrained import resolve_model_path as resolve_model_path

@@ -64,14 +64,3 @@ def test_a_family_from_data_to_a_moving_arm(family: str, data: Path, tmp_path: P
     assert sent.shape[1] == 14
     assert np.isfinite(sent).all()
     assert np.abs(np.diff(sent, axis=0)).max() > 0
-
-
-def test_a_batch_that_does_not_fit_names_the_line_of_the_config(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = tiny("act", tmp_path, data)
-    words = ["run", "--config", str(config), "--section", "runner"]
-    changed = ["--set", 'train_dataloader.dataset.img_keys=["top"]']
-    assert main([*words, "--work-dir", str(tmp_path / "work"), *changed]) == 2
-    said = capsys.readouterr().err
-    assert "act.py:1: model: ACT: num_cameras is 2, the batch has 3 image channels" in said

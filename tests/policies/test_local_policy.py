@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fluxvla_core.errors import CheckpointError, ConfigError, DataError, SpecMismatch
+from fluxvla_core.models import InputSizes
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
@@ -386,3 +387,58 @@ def test_weights_of_another_model_and_damaged_files_are_refused(tmp_path):
         wrong = writer.commit()
     with pytest.raises(CheckpointError, match="gain"):
         load(wrong)
+
+
+class SizedVLA(LittleVLA):
+    """Says what it takes, and must not be built of what does not fit."""
+
+    input_sizes = InputSizes(
+        cameras="num_cameras", image_size=(12, 16), states="action_dim", horizon=4
+    )
+
+    def __init__(self, action_dim: int = 2, num_cameras: int = 1) -> None:
+        raise AssertionError("it was built")
+
+
+@pytest.fixture
+def sized():
+    VLAS.register_module()(SizedVLA)
+    yield {"type": "SizedVLA"}
+    VLAS.unregister("SizedVLA")
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "words"),
+    [
+        ({"num_cameras": 2}, {}, "model.num_cameras: SizedVLA: the number of cameras is 2, in the"),
+        (
+            {"action_dim": 3},
+            {},
+            "model.action_dim: SizedVLA: the width of states is 3, in the data",
+        ),
+        ({}, {"policy.json": {"action_rate_hz": 10.0, "horizon": 5}}, "has 4 actions, the horizon"),
+    ],
+)
+def test_a_model_that_does_not_take_what_it_would_be_given_is_not_built(
+    tmp_path, sized, model, changes, words
+):
+    path = save(tmp_path, config={"model": {**sized, **model}}, **changes)
+    with pytest.raises(SpecMismatch, match=words) as error:
+        load(path)
+    assert error.value.where == str(path)
+
+
+def test_images_of_another_size_are_refused_before_the_model_is_built(tmp_path, sized):
+    kept = [{"type": "NormalizeStatesAndActions", "norm_type": "mean_std"}]
+    path = save(tmp_path, config={"model": sized}, dataset={"transforms": kept})
+    with pytest.raises(SpecMismatch, match="size of images is 12 x 16, in the data it is 24 x 32"):
+        load(path)
+
+
+def test_who_drives_the_robot_can_refuse_before_the_model_is_built(tmp_path, sized):
+    def check(robot: EmbodimentSpec, cameras: tuple[str, ...]) -> None:
+        assert (robot, cameras) == (ARM, ("front",))
+        raise SpecMismatch("another robot")
+
+    with pytest.raises(SpecMismatch, match="another robot"):
+        load(save(tmp_path, config={"model": sized}), check=check)

@@ -111,9 +111,13 @@ def _train(plan: Plan, runner: Any, context: Any) -> tuple[Any, int]:
     from fluxvla_core.build import build_dataset_from_cfg
     from fluxvla_core.contracts.runner import TrainRunner
     from fluxvla_core.errors import located
+    from fluxvla_core.training.base_runner import BaseTrainRunner
+    from fluxvla_core.training.input_sizes import check_data
 
     with located(context.where("train_dataloader.dataset")):
         dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
+    if isinstance(runner, BaseTrainRunner):
+        check_data(context, dataset, runner.collator)
     try:
         runner.run_setup(n_train_examples=len(dataset))
         ranks.mark_started(plan.work_dir)

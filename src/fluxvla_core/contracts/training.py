@@ -37,6 +37,38 @@ class PartWeights:
     unread: Sequence[str] = ()
 
 
+Size = int | str | tuple[str, Callable[[Any], Any]] | None
+
+
+@dataclass(frozen=True)
+class InputSizes:
+    """Sizes of the batches that a model takes, as arguments of its constructor say them.
+
+    Data, robots and checkpoints are compared with them before a model is built. Each is the name of
+    an argument (``vla_head.horizon``: of the table ``vla_head``; ``a | b``: of the one that is
+    set), a number, or such a name and a function of the value. None is any size, also as a value.
+
+    Args:
+        cameras: images of an observation.
+        image_size: pixels of a side, or height and width.
+        states, actions: numbers of a state and of an action, behind the transforms.
+        horizon: actions of a chunk.
+        embodiments: robots that there are weights for; ``embodiment_ids`` are below it.
+        n_obs_steps, past_actions: as of ``VLA``.
+        float_images: images are floats, which a transform has to make of bytes.
+    """
+
+    cameras: Size = None
+    image_size: Size = None
+    states: Size = None
+    actions: Size = None
+    horizon: Size = None
+    embodiments: Size = None
+    n_obs_steps: Size = None
+    past_actions: Size = None
+    float_images: bool = False
+
+
 class VLA(Contract):
     """A model, with the facts that training strategies need: ``class MyVLA(VLA, nn.Module)``.
 
@@ -45,6 +77,8 @@ class VLA(Contract):
     """
 
     forward: Callable[..., Any]
+    input_sizes: ClassVar[InputSizes] = InputSizes()
+    """The sizes of its batches, by which data that do not fit are refused before it is built."""
     _together: ClassVar[tuple[tuple[str, ...], ...]] = (("observe", "denoise"),)
 
     def batch_keys(self) -> Mapping[str, bool] | None:

@@ -218,6 +218,12 @@ class ParquetDataset(Dataset):
         other.pipeline, other.statistics = pipeline, self.statistics
         return other
 
+    def uncached(self) -> ParquetDataset:
+        """The same samples, decoded when they are asked for; for reading a few only."""
+        other = copy(self)
+        other.statistics, other._frames = self.statistics, Frames(self.loaded, cache=False)
+        return other
+
     def prepare(self, reporter: Reporter | None = None) -> None:
         """Decode into memory, if ``cache_frames`` asks for it; workers then inherit it."""
         self._frames.prepare(reporter or SilentReporter())

@@ -131,7 +131,7 @@ def try_preparation(
     state_dim: int,
     chunk: tuple[int, int],
     where: str,
-) -> None:
+) -> Mapping[str, Any]:
     """Prepare a blank observation, and scale a chunk of zeros back.
 
     Errors of transforms and statistics (a number of images, a width, a missing statistic) come at
@@ -144,6 +144,9 @@ def try_preparation(
         chunk: actions, and numbers of each.
         where: the checkpoint.
 
+    Returns:
+        The batch of the observation, empty where ``prepare`` gives something else.
+
     Raises:
         FluxError: what they raise.
     """
@@ -151,5 +154,6 @@ def try_preparation(
     images = {name: np.zeros((*size, 3), np.uint8) for name, size in cameras.items()}
     observation = {"qpos": states, "images": images, "task_description": _INSTRUCTION}
     with located(where):
-        prepare(observation)
+        batch = prepare(observation)
         denormalize({"action": np.zeros((1, *chunk), np.float32), "states": states})
+    return batch if isinstance(batch, Mapping) else {}

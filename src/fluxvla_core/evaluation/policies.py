@@ -16,7 +16,7 @@ from fluxvla_core.contracts.environment import Environment, EnvironmentSpec
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Actor
 from fluxvla_core.errors import ConfigError, SpecMismatch
-from fluxvla_core.spec import Camera, check_match
+from fluxvla_core.spec import Camera, EmbodimentSpec, check_match
 
 if TYPE_CHECKING:
     from fluxvla_core.policies.local import LocalPolicy
@@ -172,12 +172,44 @@ def match_policy(
             gripper polarity, absolute or delta, rate; or a camera is missing.
     """
     policy = Actor.adapt(policy)
-    embodiment = policy.embodiment
+    return _match(policy.embodiment, tuple(policy.cameras), policy.action_rate_hz, spec, size)
+
+
+def match_checkpoint(path: str, dataset: Any, spec: EnvironmentSpec) -> None:
+    """As ``match_policy``, before the model of the checkpoint at ``path`` is built.
+
+    What it does not say is left to ``load_policy``.
+
+    Args:
+        dataset: what prepares observations instead of the checkpoint's, as of ``load_policy``.
+
+    Raises:
+        SpecMismatch: see ``match_policy``.
+        CheckpointError: a file of the checkpoint is missing or damaged.
+    """
+    from fluxvla_core.checkpoints.checkpoint import Checkpoint
+    from fluxvla_core.data.lerobot import camera_name
+    from fluxvla_core.data.mixture import first_dataset
+
+    checkpoint = Checkpoint.open(path)
+    robot, rate = checkpoint.embodiment(), checkpoint.policy().get("action_rate_hz")
+    own = first_dataset(checkpoint.config().get("train_dataloader", {}).get("dataset", {}))
+    table = own if dataset is None else dataset
+    keys = table.get("img_keys") if isinstance(table, Mapping) else None
+    if robot is not None and rate is not None and keys is not None:
+        _match(robot, tuple(camera_name(key) for key in keys), rate, spec, None)
+
+
+def _match(
+    embodiment: EmbodimentSpec | None,
+    names: tuple[str, ...],
+    rate: float | None,
+    spec: EnvironmentSpec,
+    size: tuple[int, int] | None,
+) -> tuple[Camera, ...]:
     trained = {c.name: c for c in embodiment.cameras} if embodiment is not None else {}
-    names = tuple(policy.cameras)
     if embodiment is not None:
         check_match(embodiment, spec.embodiment, "the policy", spec.name, cameras=names)
-    rate = policy.action_rate_hz
     if not spec.limited and rate is not None and rate != spec.embodiment.rate_hz:
         raise SpecMismatch(
             f"the policy's actions are for steps of 1/{rate:g} s, "

@@ -38,6 +38,7 @@ from fluxvla_core.evaluation.policies import (
     UNTRAINED,
     chosen_checkpoint,
     load,
+    match_checkpoint,
     policy_tables,
     resolve_policy,
 )
@@ -122,6 +123,7 @@ class EvalRunner(Runner):
             ConfigError: the environment has no such task or camera, or names no expert; or the
                 policy cannot compute here as it should.
             CheckpointError: there is no checkpoint, or the one that is named is damaged.
+            SpecMismatch: the policy is for another robot.
         """
         given = self.options
         environment = Environment.adapt(build_environment_from_cfg(self._environment))
@@ -148,6 +150,7 @@ class EvalRunner(Runner):
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
         path = None if self._checkpoint is None else self._checkpoint["path"]
         if path is not None:
+            match_checkpoint(path, given.dataset, self._spec)
             self._check_joining(path)
         sources = {POLICY: given.source(policy, path)}
         if given.baseline:

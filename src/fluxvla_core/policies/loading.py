@@ -6,7 +6,7 @@ import inspect
 import logging
 import os
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ def load_policy(
     mixed_precision_dtype: str = "float32",
     execution: str = "eager",
     quantization: str | None = None,
+    check: Callable[[EmbodimentSpec, tuple[str, ...]], object] | None = None,
 ) -> LocalPolicy:
     """Build the policy that a checkpoint holds; its config is data and never executed.
 
@@ -54,10 +55,13 @@ def load_policy(
             denoising steps as one CUDA graph, on a GPU).
         quantization: ``int8``, ``fp8`` (weights of the blocks) or ``fp8_dynamic`` (their
             activations, too), by torchao.
+        check: called before the model is built, with the robot that the policy was trained for and
+            the names of the cameras that it looks at; what it raises ends the loading.
 
     Raises:
         CheckpointError: it is missing, damaged, or of another model.
-        SpecMismatch: it does not say for which robot, or at which rate, its actions are.
+        SpecMismatch: it does not say for which robot, or at which rate, its actions are; or its
+            model does not take what its robot and its transforms give.
         ConfigError, PluginError: a part that its config names cannot be built here.
     """
     from fluxvla_core.policies.execution import check_execution
@@ -95,19 +99,23 @@ def load_policy(
         for given in (dataset, denormalize_action)
     )
     if not own_objects:  # somebody's own may count what they are asked
-        _try(prepare, denormalize, embodiment, int(facts["horizon"]), where)
+        batch = _try(prepare, denormalize, embodiment, int(facts["horizon"]), where)
+        _check_sizes(config.get("model"), batch, int(facts["horizon"]), where)
+    keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
+    cameras = tuple(camera_name(key) for key in keys)
+    if check is not None:
+        check(embodiment, cameras)
     if device == "cuda":
         import torch
 
         device = own_device(os.environ, torch.cuda.device_count())
     model = ready(_model(checkpoint, device), mixed_precision_dtype, quantization)
-    keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
     return LocalPolicy(
         model=model,
         prepare=prepare,
         denormalize=denormalize,
         embodiment=embodiment,
-        cameras=tuple(camera_name(key) for key in keys),
+        cameras=cameras,
         action_rate_hz=float(facts["action_rate_hz"]),
         horizon=int(facts["horizon"]),
         device=device,
@@ -186,12 +194,43 @@ def _model(checkpoint: Checkpoint, device: str) -> Any:
     return model.to(device).eval()
 
 
-def _try(prepare: Any, denormalize: Any, robot: EmbodimentSpec, horizon: int, where: str) -> None:
-    """Try them before weights are read; who drives the robot reports cameras that it lacks."""
+def _try(
+    prepare: Any, denormalize: Any, robot: EmbodimentSpec, horizon: int, where: str
+) -> Mapping[str, Any]:
+    """The batch of a blank observation, made before weights are read; empty if the robot lacks a
+    camera, which is reported by who drives it."""
     sizes = {camera.name: (camera.height, camera.width) for camera in robot.cameras}
     keys = getattr(prepare, "img_keys", ())
-    if all(camera_name(key) in sizes for key in keys):
-        try_preparation(prepare, denormalize, sizes, robot.state_dim, (horizon, robot.dim), where)
+    if not all(camera_name(key) in sizes for key in keys):
+        return {}
+    chunk = (horizon, robot.dim)
+    return try_preparation(prepare, denormalize, sizes, robot.state_dim, chunk, where)
+
+
+def _check_sizes(table: Any, batch: Mapping[str, Any], horizon: int, where: str) -> None:
+    """Compare a checkpoint's ``model`` table with what it would be given, before it is built.
+
+    Raises:
+        SpecMismatch: it takes something else; names the keys and both values.
+    """
+    from fluxvla_core.training.input_sizes import advice, declared_sizes, misfits
+
+    sizes = declared_sizes(table)
+    found = [f"model.{one.key}: {one.text}" for one in misfits(table, batch, sizes)]
+    chunk = sizes.get("horizon")
+    if chunk is not None and chunk.value != horizon:
+        found.append(
+            f"model.{chunk.key}: a chunk of the model has {chunk.value} actions, the horizon of "
+            f"the checkpoint's policy.json is {horizon}"
+        )
+    if found:
+        raise SpecMismatch(
+            "\n  ".join(found),
+            where=where,
+            cause="its files belong to different trainings, or the section's dataset is not that "
+            "of its training",
+            next=advice(misfits(table, batch, sizes)) or None,
+        )
 
 
 def _prepare(dataset: Any, trained_on: Mapping[str, Any], checkpoint: Checkpoint) -> Any:

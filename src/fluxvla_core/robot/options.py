@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from fluxvla_core.build import RunContext, build_action_filter_from_cfg
-from fluxvla_core.contracts.policy import Policy
 from fluxvla_core.contracts.robot import ActionFilter
 from fluxvla_core.control.filters import SnapGripper
 from fluxvla_core.control.joiners import make_joiner
@@ -162,7 +161,8 @@ class InferenceOptions:
 
 
 def fit_cameras(
-    policy: Policy,
+    trained: EmbodimentSpec,
+    looks_at: tuple[str, ...],
     embodiment: EmbodimentSpec,
     chosen: tuple[str, ...] | None,
     context: RunContext,
@@ -170,7 +170,7 @@ def fit_cameras(
     """Check that a policy is for a robot; the names of the cameras to observe.
 
     Args:
-        policy: loaded.
+        trained: the robot that the policy was trained for; looks_at: names of its cameras.
         embodiment: the robot's.
         chosen: the config's ``camera_names``; None for those that the policy looks at.
         context: of the run; its reporter warns of images that are scaled.
@@ -179,9 +179,8 @@ def fit_cameras(
         SpecMismatch: the policy is for another robot, or for other views.
         ConfigError: ``camera_names`` does not fit.
     """
-    looks_at = tuple(policy.cameras)
     cameras = chosen or looks_at
-    check_match(policy.embodiment, embodiment, "the policy", "the robot", looks_at)
+    check_match(trained, embodiment, "the policy", "the robot", looks_at)
     known = embodiment.camera_names
     for name in (*cameras, *looks_at):
         if name not in known:
@@ -190,7 +189,7 @@ def fit_cameras(
             )
         if name not in cameras:
             raise context.error("camera_names", f"the policy looks at {name!r} too")
-    for warning in _scaled_views(policy.embodiment, embodiment, looks_at):
+    for warning in _scaled_views(trained, embodiment, looks_at):
         context.reporter.warn(warning)
     return cameras
 

@@ -58,6 +58,7 @@ from fluxvla_core.robot.recording.ros_messages import typestore
 from fluxvla_core.robot.recording.trace import next_folder
 from fluxvla_core.robot.robot import Robot
 from fluxvla_core.robot.tasks import Task, TaskSource, check_descriptions, task_source
+from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 FOLDER = "inference"
@@ -151,7 +152,8 @@ class BaseInferenceRunner(Runner):
             typestore()  # before anything moves: what recording needs is installed
         if self.context.task is not None or self.context.task_file is not None:
             self._task_source()
-        if self.policy is None:
+        loaded = self.policy is None
+        if loaded:
             from fluxvla_core.policies.loading import (
                 find_checkpoint,
                 load_policy,
@@ -166,6 +168,7 @@ class BaseInferenceRunner(Runner):
             self.policy = load_policy(
                 place, given.device, given.dataset, given.denormalize_action,
                 given.mixed_precision_dtype, given.execution, given.quantization,
+                check=self._fit_cameras,
             )  # fmt: skip
         check_policy(self.policy)
         self.policy = Policy.adapt(self.policy)
@@ -175,7 +178,8 @@ class BaseInferenceRunner(Runner):
                 f"is {self.chunk_joining!r}, and {type(self.policy).__name__} cannot continue a "
                 "chunk: neither it nor its model takes what is left of the last one",
             )
-        self._cameras = fit_cameras(self.policy, self.embodiment, self.camera_names, self.context)
+        if not loaded:
+            self._fit_cameras(self.policy.embodiment, tuple(self.policy.cameras))
         if self.prepare_pose is not None:
             check_pose(self.prepare_pose, self.embodiment)
         if not self.robot.can_stop:
@@ -183,6 +187,11 @@ class BaseInferenceRunner(Runner):
                 f"{self.robot.name} has no stop(): it is stopped by commands that brake, and held "
                 "by the last of them; a robot that does not hold its last command needs a stop()"
             )
+
+    def _fit_cameras(self, trained: EmbodimentSpec, looks_at: tuple[str, ...]) -> None:
+        """Check that a policy is for this robot; a checkpoint's before its model is built."""
+        names, context = self.camera_names, self.context
+        self._cameras = fit_cameras(trained, looks_at, self.embodiment, names, context)
 
     def run(self) -> dict[str, Any]:
         """Connect, do the tasks of the command line, of a person or of a topic, and stop.

@@ -162,6 +162,7 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.contracts.training import VLA
         from fluxvla_core.training import lora
         from fluxvla_core.training.cost import Meter
+        from fluxvla_core.training.input_sizes import check_start
         from fluxvla_core.training.model import checkpoint_activations, compile_units
         from fluxvla_core.training.state import seed_all
         from fluxvla_core.training.weights import base_to_note, put_parts, start_training_from
@@ -175,6 +176,7 @@ class BaseTrainRunner(Strategy):
                 next="model = dict(type='CompactVLA', …); fluxvla plugins list has what there is",
             )
         seed_all(self.options.seed)
+        check_start(self.context, self.options.init_from, self.resume_checkpoint)
         with located(self.context.where("model")):
             vla: nn.Module = build_vla_from_cfg(self.cfg["model"], self.context)
         options, before = self.options, self.resume_checkpoint

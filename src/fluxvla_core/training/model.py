@@ -11,9 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fluxvla_core.build import RunContext
 from fluxvla_core.checkpoints.tensors import full_tensor
-from fluxvla_core.contracts.training import VLA, Dataset
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.loader import IDS
 from fluxvla_core.errors import ConfigError
 
@@ -45,30 +44,10 @@ def set_frozen_source(model: nn.Module, source: str | None) -> None:
         model.__dict__["frozen_source"] = source
 
 
-def check_observations(
-    model: nn.Module, dataset: Any, context: RunContext, section: str = "train_dataloader"
-) -> None:
-    """Check that samples show as many observations and past actions as the model takes.
-
-    Args:
-        dataset: of ``section``; one that is made of others, each of them.
-
-    Raises:
-        ConfigError: they show others: a chunk of the wrong times is learnt without any error.
-    """
-    wanted = VLA.adapt(model)
-    for each in Dataset.adapt(dataset).datasets or [dataset]:
-        shown = Dataset.adapt(each)
-        for name in ("n_obs_steps", "past_actions"):
-            takes, has = getattr(wanted, name), getattr(shown, name)
-            if takes != has:
-                raise ConfigError(
-                    f"{name} of the model is {takes}, that of the dataset {has}",
-                    where=context.where(f"{section}.dataset.{name}"),
-                    cause="a model's samples have its observations, and the actions that belong "
-                    "to them",
-                    next=f"--set {section}.dataset.{name}={takes}",
-                )
+def observations_of(model: nn.Module) -> dict[str, int | None]:
+    """``n_obs_steps`` and ``past_actions`` of a model, for ``check_observations``."""
+    described = VLA.adapt(model)
+    return {name: getattr(described, name) for name in ("n_obs_steps", "past_actions")}
 
 
 # -- how its blocks and its forward pass compute ---------------------------------------------

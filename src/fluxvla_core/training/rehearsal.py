@@ -22,7 +22,7 @@ from fluxvla_core.build import (
 )
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.example import Example, Refused, example
-from fluxvla_core.errors import ConfigError, FluxError
+from fluxvla_core.errors import CheckpointError, ConfigError, FluxError
 from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
@@ -35,8 +35,18 @@ from fluxvla_core.training.cost import (
     kept_by_fake,
     optimizer_bytes,
 )
+from fluxvla_core.training.input_sizes import (
+    Declared,
+    check_observations,
+    check_start,
+    chunk_of,
+    declared_sizes,
+    misfits,
+    observations_in,
+    refusal,
+)
 from fluxvla_core.training.lora import LoraOptions
-from fluxvla_core.training.model import ForwardArguments, Layout, check_observations, trainable
+from fluxvla_core.training.model import ForwardArguments, Layout, observations_of, trainable
 from fluxvla_core.training.strategy import Strategy
 
 T = TypeVar("T")
@@ -60,7 +70,8 @@ class Rehearsal:
         notes: missing knowledge, and parts that do not fit together.
         skeleton: the model on the meta device, with its adapters.
         inputs: the batch itself.
-        refused: the error that would end the training at its first batch.
+        refused: the error that would end the training before its first step.
+        unfit: the data, or the weights to start from, are not for this model: it was not built.
     """
 
     robot: EmbodimentSpec | None = None
@@ -77,6 +88,7 @@ class Rehearsal:
     skeleton: nn.Module | None = None
     inputs: Mapping[str, Any] | None = None
     refused: FluxError | None = None
+    unfit: bool = False
 
 
 def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
@@ -89,25 +101,23 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
     rehearsal = Rehearsal()
     notes = rehearsal.notes
     rehearsal.robot = _tried(notes, "the robot is not known", lambda: robot_of(context.config))
-    what = "the model cannot be built on the meta device"
-    model = _tried(notes, what, lambda: on_meta(context))
     runner = _runner(context, notes)
-    if model is not None:
-        rehearsal.model = type(model).__name__
-        rehearsal.parameters = sum(p.numel() for p in model.parameters())
-        rehearsal.action_shape = VLA.adapt(model).action_shape
-        if runner is not None and runner.lora is not None:
-            attach = partial(_with_adapters, model, runner.lora, context)
-            model = _tried(notes, "adapters cannot be put into the model", attach)
-    if model is not None:
-        rehearsal.trained = sum(p.numel() for p in trainable(model).values())
+    sizes = _declared(context)
+    rehearsal.action_shape = chunk_of(sizes)
+    # Before the data only where nothing else says how long a chunk is.
+    model = None if sizes else _model(context, rehearsal, runner)
     batch = _batch(context, rehearsal, runner)
+    rehearsal.refused = rehearsal.refused or _unfit(context, rehearsal, runner, sizes, batch)
+    if sizes and not rehearsal.unfit:
+        model = _model(context, rehearsal, runner)
     rehearsal.skeleton, rehearsal.inputs = model, batch
     _compare(rehearsal)
-    if model is not None and batch is not None:
+    if rehearsal.refused is not None:
+        batch = None
+    elif model is not None and batch is not None:
         try:
             if rehearsal.data is not None and rehearsal.data.dataset is not None:
-                check_observations(model, rehearsal.data.dataset, context)
+                check_observations(observations_of(model), rehearsal.data.dataset, context)
             ForwardArguments(model, context.where(f"{context.section}.collator"))(batch)
         except ConfigError as error:
             rehearsal.refused, batch = error, None
@@ -118,6 +128,58 @@ def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehea
         return rehearsal
     _count(rehearsal, model, runner, batch, processes)
     return rehearsal
+
+
+def _declared(context: RunContext) -> Mapping[str, Declared]:
+    """What the model's class says about the sizes of its batches; nothing if it cannot be had."""
+    try:
+        return declared_sizes(context.config["model"])
+    except FluxError:
+        return {}  # noted where the model is built
+
+
+def _unfit(
+    context: RunContext,
+    found: Rehearsal,
+    runner: BaseTrainRunner | None,
+    sizes: Mapping[str, Declared],
+    batch: Mapping[str, Any] | None,
+) -> FluxError | None:
+    """Why data, or the weights to start from, do not fit the model, which is not built then."""
+    table = context.config["model"]
+    try:
+        if runner is not None:
+            check_start(context, runner.options.init_from, only_here=True)
+        if not sizes:
+            return None
+        if found.data is not None and found.data.dataset is not None:
+            check_observations(observations_in(table, sizes), found.data.dataset, context)
+        wrong = [] if batch is None else misfits(table, batch, sizes)
+    except (ConfigError, CheckpointError) as error:
+        found.unfit = True
+        return error
+    found.unfit = bool(wrong)
+    return refusal(wrong, context) if wrong else None
+
+
+def _model(
+    context: RunContext, found: Rehearsal, runner: BaseTrainRunner | None
+) -> nn.Module | None:
+    """The model on the meta device, with its adapters; what is known of it goes into ``found``."""
+    notes = found.notes
+    what = "the model cannot be built on the meta device"
+    model = _tried(notes, what, lambda: on_meta(context))
+    if model is None:
+        return None
+    found.model = type(model).__name__
+    found.parameters = sum(p.numel() for p in model.parameters())
+    found.action_shape = VLA.adapt(model).action_shape
+    if runner is not None and runner.lora is not None:
+        attach = partial(_with_adapters, model, runner.lora, context)
+        model = _tried(notes, "adapters cannot be put into the model", attach)
+    if model is not None:
+        found.trained = sum(p.numel() for p in trainable(model).values())
+    return model
 
 
 def on_meta(context: RunContext) -> nn.Module:

@@ -20,7 +20,8 @@ from fluxvla_core.data.sampler import StepSampler, episode_shards
 from fluxvla_core.errors import located
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.training.cost import GB, peak_bytes
-from fluxvla_core.training.model import ForwardArguments, check_observations, trainable
+from fluxvla_core.training.input_sizes import check_observations
+from fluxvla_core.training.model import ForwardArguments, observations_of, trainable
 from fluxvla_core.training.resuming import forget_missing, restore_rng
 from fluxvla_core.training.saving import Saver
 from fluxvla_core.training.state import Ema
@@ -77,7 +78,7 @@ class Trainer:
         runner.saver = Saver(world, options.async_save, runner.optimizer)
         where = context.where(f"{context.section}.collator")
         runner.forward_arguments = ForwardArguments(runner.model, where)
-        check_observations(runner.model, dataset, context)
+        check_observations(observations_of(runner.model), dataset, context)
         if runner.left_out is None:
             runner.left_out = left_out(runner.model)
         if options.ema_decay is not None:
@@ -96,7 +97,8 @@ class Trainer:
             return None
         seed = runner.options.seed
         held_out = validation_dataset(runner.context, dataset, seed)
-        check_observations(runner.model, held_out, runner.context, "val_dataloader")
+        takes = observations_of(runner.model)
+        check_observations(takes, held_out, runner.context, "val_dataloader")
         return Validation(
             held_out, runner.collator, runner.val_options, runner.world, seed, self._stop
         )

@@ -11,7 +11,12 @@ from fluxvla_models.guidance import Guide
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA, build_head_from_cfg, build_vlm_backbone_from_cfg
+from fluxvla_core.models import (
+    VLA,
+    InputSizes,
+    build_head_from_cfg,
+    build_vlm_backbone_from_cfg,
+)
 from fluxvla_gr00t.context import Context
 
 
@@ -29,6 +34,15 @@ class GR00T(VLA, nn.Module):
         pretrained_name_or_path: weights that a training starts from, for instance a published
             checkpoint's folder.
     """
+
+    input_sizes = InputSizes(
+        image_size="vlm_backbone.image_size",
+        states="vla_head.state_dim",
+        actions="vla_head.action_dim",
+        horizon="vla_head.horizon",
+        embodiments="vla_head.embodiments",
+        float_images=True,
+    )
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA, PartWeights
+from fluxvla_core.models import VLA, InputSizes, PartWeights
 from fluxvla_models.resnet import ResNet, published
 from fluxvla_models.transformer import Decoder, Encoder, positions_1d, positions_2d
 from fluxvla_models.widths import check_states
@@ -43,6 +43,14 @@ class ACT(VLA, nn.Module):
             batch's where chunks go beyond an episode's end.
         pretrained_name_or_path: where a training starts from, as ``runner.init_from``.
     """
+
+    input_sizes = InputSizes(
+        cameras="num_cameras",
+        states="state_dim",
+        actions="action_dim",
+        horizon="horizon",
+        float_images=True,
+    )
 
     def __init__(
         self,

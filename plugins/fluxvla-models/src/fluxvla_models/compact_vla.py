@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from fluxvla_core.models import (
     VLA,
+    InputSizes,
     build_head_from_cfg,
     build_llm_backbone_from_cfg,
     build_projector_from_cfg,
@@ -30,6 +31,15 @@ class CompactVLA(VLA, nn.Module):
         vla_head: table or module; its ``context_dim`` is filled in here.
         state_dim: length of the (padded) state vector.
     """
+
+    input_sizes = InputSizes(
+        cameras="vision_backbone.num_cameras",
+        image_size="vision_backbone.image_size",
+        states="state_dim",
+        actions="vla_head.action_dim",
+        horizon="vla_head.horizon",
+        float_images=True,
+    )
 
     def __init__(
         self,

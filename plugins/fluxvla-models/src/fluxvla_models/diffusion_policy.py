@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA, PartWeights
+from fluxvla_core.models import VLA, InputSizes, PartWeights
 from fluxvla_models.conditional_unet import ConditionalUNet
 from fluxvla_models.diffusion_schedule import DiffusionSchedule
 from fluxvla_models.keypoint_encoder import KeypointEncoder
@@ -53,6 +53,16 @@ class DiffusionPolicy(VLA, nn.Module):
             losses is not the whole batch's where chunks go beyond an episode's end.
         pretrained_name_or_path: where a training starts from, as ``runner.init_from``.
     """
+
+    input_sizes = InputSizes(
+        cameras="num_cameras",
+        states="state_dim",
+        actions="action_dim",
+        horizon="horizon",
+        n_obs_steps="n_obs_steps",
+        past_actions=("n_obs_steps", lambda steps: steps - 1),
+        float_images=True,
+    )
 
     def __init__(
         self,

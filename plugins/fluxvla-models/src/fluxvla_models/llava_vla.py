@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import (
     VLA,
+    InputSizes,
     PartWeights,
     build_head_from_cfg,
     build_llm_backbone_from_cfg,
@@ -20,6 +21,12 @@ from fluxvla_core.models import (
 )
 
 Part = Mapping[str, Any] | nn.Module
+
+
+def _image_size(sizes: Mapping[str, Any] | None) -> int | None:
+    """Of a vision tower's ``sizes``, or those of a model that has one."""
+    vision = sizes.get("vision_config", sizes) if sizes else {}
+    return vision.get("image_size")
 
 
 class LlavaVLA(VLA, nn.Module):
@@ -46,6 +53,15 @@ class LlavaVLA(VLA, nn.Module):
     Raises:
         ConfigError: parts that do not go together, or a ``name_mapping`` of no place.
     """
+
+    input_sizes = InputSizes(
+        cameras="vision_backbone.num_cameras | vlm_backbone.num_cameras",
+        image_size=("vision_backbone.sizes | vlm_backbone.sizes", _image_size),
+        states="vla_head.state_dim",
+        actions="vla_head.action_dim",
+        horizon="vla_head.horizon",
+        float_images=True,
+    )
 
     def __init__(
         self,

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from fluxvla_core.models import InputSizes
 from fluxvla_openvla.language import Prompt, decode, hidden_states
 from fluxvla_openvla.prismatic import Prismatic
 from fluxvla_openvla.sizes import LanguageSize, TowerSize
@@ -72,6 +73,10 @@ class OpenVLA(Prismatic):
     Raises:
         ConfigError: sizes that do not fit together.
     """
+
+    input_sizes = InputSizes(
+        cameras=1, image_size="image_size", actions="action_dim", horizon=1, float_images=True
+    )
 
     def __init__(
         self,

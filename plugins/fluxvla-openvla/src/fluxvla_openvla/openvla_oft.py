@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fluxvla_core.errors import ConfigError
+from fluxvla_core.models import InputSizes
 from fluxvla_openvla.heads import (
     DiffusionHead,
     L1RegressionHead,
@@ -50,6 +51,15 @@ class OpenVLAOFT(Prismatic):
     Raises:
         ConfigError: sizes that do not fit together, or an unknown head.
     """
+
+    input_sizes = InputSizes(
+        cameras="num_images",
+        image_size="image_size",
+        states=("state_dim", lambda width: width or None),
+        actions="action_dim",
+        horizon="horizon",
+        float_images=True,
+    )
 
     def __init__(
         self,

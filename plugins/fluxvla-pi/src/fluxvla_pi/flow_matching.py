@@ -21,12 +21,12 @@ from fluxvla_models.widths import check_actions
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA
+from fluxvla_core.models import VLA, InputSizes
 from fluxvla_pi.acting import Seen, expert_step, seen_of
 from fluxvla_pi.gemma import GemmaDecoder, Rope, rope_of
 from fluxvla_pi.paligemma import Prefix, embed_prefix
 from fluxvla_pi.siglip import SiglipVisionTower
-from fluxvla_pi.sizes import gemma_size, siglip_size
+from fluxvla_pi.sizes import gemma_size, image_side, siglip_size
 
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
 
@@ -87,6 +87,12 @@ class PiFlowMatching(VLA, nn.Module):
 
     adaptive: bool
     """Whether the time enters by adaptive normalisation."""
+    input_sizes = InputSizes(
+        image_size=("vision_variant", image_side),
+        actions="max_action_dim",
+        horizon="n_action_steps",
+        float_images=True,
+    )
 
     def __init__(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -23,6 +24,7 @@ class PI0FlowMatching(PiFlowMatching):
     """
 
     adaptive = False
+    input_sizes = replace(PiFlowMatching.input_sizes, states="max_state_dim")
 
     def __init__(self, max_state_dim: int = 32, **kwargs: Any) -> None:
         super().__init__(**kwargs)

@@ -20,12 +20,12 @@ from torch.nn import functional
 
 from fluxvla_core import build_tokenizer_from_cfg
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA, built_without_memory, has_values
+from fluxvla_core.models import VLA, InputSizes, built_without_memory, has_values
 from fluxvla_pi.action_tokens import ActionWords
 from fluxvla_pi.gemma import GemmaDecoder, rope_of
 from fluxvla_pi.paligemma import Prefix, embed_prefix, rope_positions
 from fluxvla_pi.siglip import SiglipVisionTower
-from fluxvla_pi.sizes import gemma_size, siglip_size
+from fluxvla_pi.sizes import gemma_size, image_side, siglip_size
 
 Cache = list[tuple[Tensor, Tensor]]
 
@@ -56,6 +56,13 @@ class PI0FAST(VLA, nn.Module):
     Raises:
         ConfigError: sizes that do not belong together, or no folder of a FAST tokenizer.
     """
+
+    input_sizes = InputSizes(
+        image_size=("vision_variant", image_side),
+        actions="action_dim",
+        horizon="n_action_steps",
+        float_images=True,
+    )
 
     def __init__(
         self,

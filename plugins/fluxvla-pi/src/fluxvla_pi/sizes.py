@@ -80,6 +80,11 @@ def siglip_size(given: str | Mapping[str, int], key: str) -> SiglipSize:
     return size
 
 
+def image_side(vision_variant: str | Mapping[str, int]) -> int:
+    """Pixels of the side of the images that a vision tower of this size sees."""
+    return siglip_size(vision_variant, "vision_variant").image_size
+
+
 def _size(
     given: str | Mapping[str, int], key: str, known: Mapping[str, Size], kind: type[Size]
 ) -> Size:

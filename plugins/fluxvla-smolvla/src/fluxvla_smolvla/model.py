@@ -19,7 +19,7 @@ from fluxvla_models.widths import check_actions, check_states
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import VLA
+from fluxvla_core.models import VLA, InputSizes
 from fluxvla_smolvla.expert import ActionTimeMLP, Expert
 from fluxvla_smolvla.sizes import TextSize, VisionSize, expert_size, size_of
 from fluxvla_smolvla.transformer import ContextLayer, KVCache, Prefix, RMSNorm, Rotation
@@ -101,6 +101,13 @@ class SmolVLA(VLA, nn.Module):
     Raises:
         ConfigError: sizes that do not go together.
     """
+
+    input_sizes = InputSizes(
+        states="max_state_dim",
+        actions="max_action_dim",
+        horizon="n_action_steps",
+        float_images=True,
+    )
 
     def __init__(
         self,

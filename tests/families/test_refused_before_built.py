@@ -1,0 +1,125 @@
+"""Data, or weights to start from, that do not fit a family are refused before it is built."""
+
+from __future__ import annotations
+
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("mujoco")
+pytest.importorskip("fluxvla_sim")
+
+from fluxvla_core import VLAS
+from fluxvla_core.cli.main import main
+from fluxvla_core.config.load import load_config
+
+from .tiny import tiny
+
+WINDOW = "train_dataloader.dataset.action_window_size=5"
+ONE_CAMERA = 'train_dataloader.dataset.img_keys=["top"]'
+CHUNK = "the number of actions in a chunk is {}, in the data it is 5"
+CAMERAS = "the number of cameras is 2, in the data it is 1"
+IMAGES = "the size of images is {0} x {0}, in the data it is 28 x 28"
+STATES = "the width of states is {}, in the data it is {}"
+ACTIONS = "the width of actions is {}, in the data it is {}"
+MISFITS = [
+    ("pi0", WINDOW, "model.n_action_steps: PI0FlowMatching: " + CHUNK.format(8)),
+    ("pi0", "model.max_state_dim=33", "model.max_state_dim: PI0FlowMatching: " + STATES.format(33, 32)),
+    ("pi0", "model.vision_variant.image_size=42", "model.vision_variant: PI0FlowMatching: " + IMAGES.format(42)),
+    ("pi05", WINDOW, "model.n_action_steps: PI05FlowMatching: " + CHUNK.format(8)),
+    ("pi05", "model.max_action_dim=33", "PI05FlowMatching: " + ACTIONS.format(33, 32)),
+    ("pi0_fast", WINDOW, "model.n_action_steps: PI0FAST: " + CHUNK.format(8)),
+    ("smolvla", WINDOW, "model.n_action_steps: SmolVLA: " + CHUNK.format(8)),
+    ("smolvla", "model.max_state_dim=33", "model.max_state_dim: SmolVLA: " + STATES.format(33, 32)),
+    ("gr00t_n15", WINDOW, "model.vla_head.horizon: GR00T: " + CHUNK.format(8)),
+    ("gr00t_n15", "model.vla_head.state_dim=65", "GR00T: " + STATES.format(65, 64)),
+    ("gr00t_n15", "model.vlm_backbone.image_size=42", "GR00T: " + IMAGES.format(42)),
+    ("gr00t_n15", "train_dataloader.dataset.embodiment_id=99", "embodiment_ids are below 32, in the data one is 99"),
+    ("gr00t_n17", WINDOW, "model.vla_head.horizon: GR00T: " + CHUNK.format(8)),
+    ("gr00t_n17", "train_dataloader.dataset.embodiment_id=99", "embodiment_ids are below 32, in the data one is 99"),
+    ("openvla", WINDOW, "model: OpenVLA: " + CHUNK.format(1)),
+    ("openvla", "model.action_dim=7", "model.action_dim: OpenVLA: " + ACTIONS.format(7, 14)),
+    ("openvla_oft", WINDOW, "model.horizon: OpenVLAOFT: " + CHUNK.format(8)),
+    ("openvla_oft", ONE_CAMERA, "model.num_images: OpenVLAOFT: " + CAMERAS),
+    ("openvla_oft", "model.state_dim=7", "model.state_dim: OpenVLAOFT: " + STATES.format(7, 14)),
+    ("openvla_oft", "model.image_size=42", "model.image_size: OpenVLAOFT: " + IMAGES.format(42)),
+    ("llava", WINDOW, "model.vla_head.horizon: LlavaVLA: " + CHUNK.format(8)),
+    ("llava", ONE_CAMERA, "model.vision_backbone.num_cameras: LlavaVLA: " + CAMERAS),
+    ("llava", "model.vision_backbone.sizes.image_size=42", "LlavaVLA: " + IMAGES.format(42)),
+    ("compact", ONE_CAMERA, "model.vision_backbone.num_cameras: CompactVLA: " + CAMERAS),
+    ("act", ONE_CAMERA, "act.py:1: model.num_cameras: ACT: " + CAMERAS),
+    ("act", WINDOW, "model.horizon: ACT: " + CHUNK.format(8)),
+    ("act", "model.state_dim=7", "model.state_dim: ACT: " + STATES.format(7, 14)),
+    ("diffusion", ONE_CAMERA, "model.num_cameras: DiffusionPolicy: " + CAMERAS),
+    ("diffusion", "model.action_dim=7", "model.action_dim: DiffusionPolicy: " + ACTIONS.format(7, 14)),
+    ("diffusion", "train_dataloader.dataset.n_obs_steps=1", "n_obs_steps of the model is 2, that of the dataset 1"),
+]  # fmt: skip
+
+
+@pytest.fixture
+def never_built(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Lets the constructor of a config's model raise."""
+
+    def forbid(config: Path) -> None:
+        cls = VLAS.get(load_config(config).tree["model"]["type"])
+        init = cls.__dict__["__init__"]
+
+        @wraps(init)
+        def refuse(self: Any, *arguments: Any, **keywords: Any) -> None:
+            raise AssertionError(f"{cls.__name__} was built")
+
+        monkeypatch.setattr(cls, "__init__", refuse)
+
+    return forbid
+
+
+@pytest.mark.parametrize(("family", "change", "words"), MISFITS)
+def test_data_that_do_not_fit(
+    family: str,
+    change: str,
+    words: str,
+    data: Path,
+    tmp_path: Path,
+    never_built: Any,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tiny(family, tmp_path, data)
+    never_built(config)
+    command = ["run", "--config", str(config), "--section", "runner", "--set", change]
+    for more in (["--work-dir", str(tmp_path / "work")], ["--dry-run"]):
+        assert main([*command, *more]) == 2
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "work").exists()
+
+
+def test_all_that_does_not_fit_is_listed_at_once(
+    data: Path, tmp_path: Path, never_built: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny("act", tmp_path, data)
+    never_built(config)
+    changes = [word for change in (WINDOW, ONE_CAMERA) for word in ("--set", change)]
+    assert main(["run", "--config", str(config), "--section", "runner", "--dry-run", *changes]) == 2
+    said = capsys.readouterr().err
+    assert "2 problems in the config" in said
+    assert CAMERAS in said
+    assert CHUNK.format(8) in said
+
+
+def test_images_that_no_transform_normalises(
+    data: Path, tmp_path: Path, never_built: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny("act", tmp_path, data)
+    tree = load_config(config).tree
+    table = tree["train_dataloader"]["dataset"]
+    kept = [t for t in table["transforms"] if not t["type"].startswith("NormalizeImages")]
+    assert len(kept) < len(table["transforms"])
+    table["transforms"] = kept
+    config.write_text("".join(f"{name} = {value!r}\n" for name, value in tree.items()))
+    never_built(config)
+    assert main(["run", "--config", str(config), "--section", "runner", "--dry-run"]) == 2
+    assert (
+        "ACT: images are normalised floats, in the data they are uint8" in capsys.readouterr().err
+    )

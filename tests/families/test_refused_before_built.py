@@ -25,10 +25,13 @@ CAMERAS = "the number of cameras is 2, in the data it is 1"
 IMAGES = "the size of images is {0} x {0}, in the data it is 28 x 28"
 STATES = "the width of states is {}, in the data it is {}"
 ACTIONS = "the width of actions is {}, in the data it is {}"
+NUMBER = "train_dataloader.dataset.embodiment_id=99"
+ROBOT = "embodiment_ids are below 32, in the data one is 99"
+OBSERVATIONS = "n_obs_steps of the model is 2, that of the dataset 1"
 MISFITS = [
     ("pi0", WINDOW, "model.n_action_steps: PI0FlowMatching: " + CHUNK.format(8)),
-    ("pi0", "model.max_state_dim=33", "model.max_state_dim: PI0FlowMatching: " + STATES.format(33, 32)),
-    ("pi0", "model.vision_variant.image_size=42", "model.vision_variant: PI0FlowMatching: " + IMAGES.format(42)),
+    ("pi0", "model.max_state_dim=33", "PI0FlowMatching: " + STATES.format(33, 32)),
+    ("pi0", "model.vision_variant.image_size=42", "PI0FlowMatching: " + IMAGES.format(42)),
     ("pi05", WINDOW, "model.n_action_steps: PI05FlowMatching: " + CHUNK.format(8)),
     ("pi05", "model.max_action_dim=33", "PI05FlowMatching: " + ACTIONS.format(33, 32)),
     ("pi0_fast", WINDOW, "model.n_action_steps: PI0FAST: " + CHUNK.format(8)),
@@ -37,9 +40,9 @@ MISFITS = [
     ("gr00t_n15", WINDOW, "model.vla_head.horizon: GR00T: " + CHUNK.format(8)),
     ("gr00t_n15", "model.vla_head.state_dim=65", "GR00T: " + STATES.format(65, 64)),
     ("gr00t_n15", "model.vlm_backbone.image_size=42", "GR00T: " + IMAGES.format(42)),
-    ("gr00t_n15", "train_dataloader.dataset.embodiment_id=99", "embodiment_ids are below 32, in the data one is 99"),
+    ("gr00t_n15", NUMBER, ROBOT),
     ("gr00t_n17", WINDOW, "model.vla_head.horizon: GR00T: " + CHUNK.format(8)),
-    ("gr00t_n17", "train_dataloader.dataset.embodiment_id=99", "embodiment_ids are below 32, in the data one is 99"),
+    ("gr00t_n17", NUMBER, ROBOT),
     ("openvla", WINDOW, "model: OpenVLA: " + CHUNK.format(1)),
     ("openvla", "model.action_dim=7", "model.action_dim: OpenVLA: " + ACTIONS.format(7, 14)),
     ("openvla_oft", WINDOW, "model.horizon: OpenVLAOFT: " + CHUNK.format(8)),
@@ -54,8 +57,8 @@ MISFITS = [
     ("act", WINDOW, "model.horizon: ACT: " + CHUNK.format(8)),
     ("act", "model.state_dim=7", "model.state_dim: ACT: " + STATES.format(7, 14)),
     ("diffusion", ONE_CAMERA, "model.num_cameras: DiffusionPolicy: " + CAMERAS),
-    ("diffusion", "model.action_dim=7", "model.action_dim: DiffusionPolicy: " + ACTIONS.format(7, 14)),
-    ("diffusion", "train_dataloader.dataset.n_obs_steps=1", "n_obs_steps of the model is 2, that of the dataset 1"),
+    ("diffusion", "model.action_dim=7", "DiffusionPolicy: " + ACTIONS.format(7, 14)),
+    ("diffusion", "train_dataloader.dataset.n_obs_steps=1", OBSERVATIONS),
 ]  # fmt: skip
 
 

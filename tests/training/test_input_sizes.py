@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
-
 from fluxvla_core import HEADS, VISION_BACKBONES, VLAS, RunContext
 from fluxvla_core.errors import CheckpointError, ConfigError
 from fluxvla_core.models import VLA, InputSizes
@@ -21,6 +19,8 @@ from fluxvla_core.training.input_sizes import (
     misfits,
     observations_in,
 )
+
+torch = pytest.importorskip("torch")
 
 
 class Head:

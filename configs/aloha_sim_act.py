@@ -6,9 +6,11 @@ fluxvla run --config configs/aloha_sim_act.py --section runner
 fluxvla run --config configs/aloha_sim_act.py --section eval
 fluxvla run --config configs/aloha_sim_act.py --section inference --task 1
 
-Hyperparameters are those of the paper's appendix, where the residual network has been trained on
-ImageNet. Here it is trained from nothing, with group normalisation. To go on from a policy that
-LeRobot trained: --set runner.init_from=FOLDER --set model.backbone_norm=frozen_batch.
+Hyperparameters are those of the paper's appendix; steps and clipping are LeRobot's
+(src/lerobot/policies/act/configuration_act.py, src/lerobot/configs/train.py). In the paper the
+residual network has been trained on ImageNet. Here it is trained from nothing, with group
+normalisation. To go on from a policy that LeRobot trained:
+--set runner.init_from=FOLDER --set model.backbone_norm=frozen_batch.
 """
 
 DATASET = "work_dirs/aloha_sim_act/dataset"

@@ -6,8 +6,10 @@ fluxvla run --config configs/aloha_sim_diffusion.py --section runner
 fluxvla run --config configs/aloha_sim_diffusion.py --section eval
 fluxvla run --config configs/aloha_sim_diffusion.py --section inference --task 1
 
-Hyperparameters are those of the convolutional policy in the appendix of arXiv 2303.04137: two
-observations, the present one and that of the action before, 16 actions; 8 are executed.
+Hyperparameters are those of the convolutional policy in the appendix of arXiv 2303.04137 and of the
+authors' real-stanford/diffusion_policy (config/train_diffusion_unet_hybrid_workspace.yaml): two
+observations, the present one and that of the action before, 16 actions; 8 are executed. Acting
+takes 10 steps of DDIM here, 100 of DDPM there; clipping and the number of steps are LeRobot's.
 """
 
 DATASET = "work_dirs/aloha_sim_diffusion/dataset"

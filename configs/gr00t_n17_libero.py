@@ -72,7 +72,9 @@ train_dataloader = dict(
 runner = dict(
     type="FSDPTrainRunner",
     max_steps=20000,
-    # AdamW (0.9, 0.999), cosine and 5 % warm-up: NVIDIA's fine-tuning of N1.7.
+    # NVIDIA's fine-tuning of N1.7 (NVIDIA/Isaac-GR00T, gr00t/configs/finetune_config.py and
+    # training/training_config.py): AdamW (0.9, 0.999), 1e-4 after 5 % of warm-up, a cosine. 20 000
+    # steps as in examples/LIBERO/README.md, where one has 640 samples: per_device_batch_size=80.
     learning_rate=1e-4,
     weight_decay=1e-5,
     lr_scheduler_type="linear-warmup+cosine-decay",
@@ -109,7 +111,7 @@ eval = dict(
     tasks=TASKS,
     seed=7,
     num_trials_per_task=50,
-    eval_chunk_size=8,  # as NVIDIA's evaluation executes
+    eval_chunk_size=8,  # as examples/LIBERO/README.md executes
     instruction_swap=True,
 )
 

@@ -2,8 +2,9 @@
 
 fluxvla run --config configs/gr00t_n17_libero_lora.py --section runner --nproc 8
 
-Rank 64 and alpha 128 are those that NVIDIA advises for N1.5 (Isaac-GR00T, scripts/gr00t_finetune.py
-with its README), with the dropout of that script; queries, keys and values get one.
+Rank 64 and alpha 128 are those that NVIDIA names for N1.5 (NVIDIA/Isaac-GR00T, README.md, which
+advises to train the head as a whole instead), with the dropout of its scripts/gr00t_finetune.py;
+queries, keys and values get one.
 """
 
 _base_ = "gr00t_n17_libero.py"

@@ -8,9 +8,10 @@ fluxvla run --config configs/llava_aloha.py --section inference --task 1
 that a dry run needs neither.
 
 Everything but the vision tower is trained, as in LLaVA's second stage, with its numbers (Liu et al.
-2024, "Improved Baselines with Visual Instruction Tuning", and scripts/v1_5/finetune.sh): AdamW,
-2e-5, no weight decay, 3 % of warm-up, a cosine, 128 samples a step. The head is new and the steps
-are ours. Everything: ``--set model.freeze_vision_backbone=false``.
+2024, "Improved Baselines with Visual Instruction Tuning", and haotian-liu/LLaVA,
+scripts/v1_5/finetune.sh): AdamW, 2e-5, no weight decay, 3 % of warm-up, a cosine, 128 samples a
+step. The head is new and the steps are ours. Everything:
+``--set model.freeze_vision_backbone=false``.
 """
 
 SIGLIP = "models/siglip-so400m-patch14-224"

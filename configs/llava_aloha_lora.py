@@ -3,7 +3,8 @@
 fluxvla run --config configs/llava_aloha_lora.py --section runner --nproc 8
 
 Rank 128, alpha 256 and 2e-4 are those of LLaVA 1.5 (scripts/v1_5/finetune_lora.sh), in every linear
-layer of the language model. Projector and action head, which is new, are trained as a whole.
+layer of the language model. Projector and action head, which is new, are trained as a whole, the
+projector there at 2e-5.
 """
 
 _base_ = "llava_aloha.py"

@@ -5,8 +5,8 @@
 
 ``BASE`` is a copy of openvla/openvla-7b, ``DATASET`` a LeRobot dataset of LIBERO's demonstrations
 (whose gripper is -1 open, 1 closed). Batch, rate and adapters are those of Kim et al., "OpenVLA"
-(2024), appendix E, and of the authors' fine-tuning, which trains until actions are right 95 % of
-the time: 50 000 to 80 000 steps.
+(2024), appendix E, and of the authors' fine-tuning (openvla/openvla, vla-scripts/finetune.py),
+which trains until actions are right 95 % of the time: 50 000 to 80 000 steps.
 """
 
 BASE = "models/openvla-7b"

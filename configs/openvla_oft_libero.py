@@ -5,8 +5,8 @@
     fluxvla run --config configs/openvla_oft_libero.py --section eval
 
 Hyperparameters are those of Kim, Finn, Liang, "Fine-Tuning Vision-Language-Action Models" (2025),
-appendix, and of the authors' ``LIBERO.md``: 8 GPUs with 8 samples each, 150 000 steps, the rate a
-tenth after 100 000.
+appendix, and of the authors' ``LIBERO.md`` (moojink/openvla-oft): 8 GPUs with 8 samples each,
+150 000 steps, the rate a tenth after 100 000.
 """
 
 _base_ = "openvla_libero.py"

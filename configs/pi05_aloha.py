@@ -56,8 +56,11 @@ train_dataloader = dict(
     ),
 )
 
-# openpi's recipe (src/openpi/training/config.py and optimizer.py): AdamW with betas 0.9 and 0.95,
-# 1000 steps of warm-up to 2.5e-5, cosine over 30000 (there to a tenth), clipping at 1, EMA 0.99.
+# openpi's recipe (src/openpi/training/config.py, TrainConfig, and optimizer.py): AdamW with betas
+# 0.9 and 0.95, weight decay 1e-10, 1000 steps of warm-up to 2.5e-5, cosine over 30000 (there to a
+# tenth), clipping at 1, EMA 0.99; 64 samples a step, as its pi05_aloha_pen_uncap, with 8 processes.
+# Its ALOHA configs count the arms' joints from the present state: relative_actions=True of the
+# dataset.
 runner = dict(
     type="FSDPTrainRunner",
     sharding_strategy="full-shard",

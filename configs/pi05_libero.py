@@ -3,8 +3,12 @@
 fluxvla run --config configs/pi05_libero.py --section runner --nproc 8
 fluxvla run --config configs/pi05_libero.py --section eval
 
-openpi's ``pi05_libero`` (src/openpi/training/config.py): chunks of 10 actions, no state in the
-prompt, 256 samples a step, 10 000 steps of warm-up to 5e-5 and no decay worth the name, EMA 0.999.
+openpi's ``pi05_libero`` (Physical-Intelligence/openpi, src/openpi/training/config.py): chunks of 10
+actions, no state in the prompt, 256 samples a step (with 8 processes), 30000 steps, of which 10000
+of warm-up to 5e-5, which stays, AdamW with betas 0.9 and 0.95, clipping at 1, EMA 0.999. It acts on
+5 actions of a chunk (examples/libero/main.py). Two things differ: openpi crops, rotates and
+recolours images in training (src/openpi/models/model.py), and counts the padding of actions in the
+loss, which ``ori_action_dim=None`` does here.
 """
 
 _base_ = "pi05_aloha.py"
@@ -12,6 +16,7 @@ _base_ = "pi05_aloha.py"
 TOKENIZER = "checkpoints/paligemma-3b-pt-224"
 DATASET = "datasets/libero_object"
 HORIZON = 10
+EXECUTED = 5
 
 model = dict(n_action_steps=HORIZON, ori_action_dim=7)
 
@@ -54,7 +59,7 @@ eval = dict(
     task_suite_name="libero_object",
     seed=7,
     num_trials_per_task=50,
-    eval_chunk_size=HORIZON,
+    eval_chunk_size=EXECUTED,
 )
 
 inference = dict(
@@ -62,5 +67,5 @@ inference = dict(
     type="LiberoInferenceRunner",
     task_suite_name="libero_object",
     seed=7,
-    eval_chunk_size=HORIZON,
+    eval_chunk_size=EXECUTED,
 )

@@ -12,7 +12,8 @@ _base_ = "pi0_libero.py"
 WEIGHTS = "checkpoints/pi0fast_base"
 TOKENIZER = "checkpoints/paligemma-3b-pt-224"
 FAST = dict(type="FastTokenizer", model_path=f"{WEIGHTS}/fast-action-tokenizer")
-# As openpi's pi0_fast_libero (src/openpi/training/config.py): chunks of 10, 7 numbers each.
+# As openpi's pi0_fast_libero (src/openpi/training/config.py): chunks of 10, 7 numbers each, 180
+# tokens; optimizer, schedule and batch are those of pi0_libero.
 HORIZON = 10
 DIMENSIONS = 7
 

@@ -2,6 +2,11 @@
 
 fluxvla run --config configs/pi0_libero.py --section runner --nproc 8
 fluxvla run --config configs/pi0_libero.py --section eval
+
+openpi's ``pi0_libero`` (src/openpi/training/config.py): chunks of 50 actions, 32 samples a step
+(with 8 processes), the rest as in ``pi05_aloha.py``; 5 actions of a chunk are executed
+(examples/libero/main.py). It has ``extra_delta_transform``, which takes the state from actions that
+are differences already; this does not.
 """
 
 _base_ = "pi05_aloha.py"
@@ -25,6 +30,7 @@ model = dict(
 )
 
 train_dataloader = dict(
+    per_device_batch_size=4,
     dataset=dict(
         data_root_path=DATASET,
         img_keys=["agentview", "robot0_eye_in_hand"],
@@ -57,7 +63,7 @@ eval = dict(
     task_suite_name="libero_object",
     seed=7,
     num_trials_per_task=50,
-    eval_chunk_size=10,
+    eval_chunk_size=5,
 )
 
 inference = dict(
@@ -65,5 +71,5 @@ inference = dict(
     type="LiberoInferenceRunner",
     task_suite_name="libero_object",
     seed=7,
-    eval_chunk_size=10,
+    eval_chunk_size=5,
 )

@@ -45,8 +45,9 @@ train_dataloader = dict(
     ),
 )
 
-# Shukor et al. 2025 (arXiv 2506.01844) and LeRobot 0.6.1's configuration_smolvla.py: batches of 64,
-# AdamW with betas of 0.9 and 0.95, 1000 steps of warm-up to 1e-4, a cosine over 30 000 steps.
+# Shukor et al. 2025 (arXiv 2506.01844) and LeRobot 0.6.1 (src/lerobot/policies/smolvla/
+# configuration_smolvla.py): batches of 64 (with 2 processes), AdamW with betas of 0.9 and 0.95,
+# weight decay 1e-10, clipping at 10, 1000 steps of warm-up to 1e-4, a cosine over 30 000 steps.
 # LeRobot's ends at 2.5e-6, this one at 0.
 runner = dict(
     max_steps=30000,

@@ -4,7 +4,8 @@ fluxvla run --config configs/smolvla_libero_lora.py --section runner --nproc 2
 
 LeRobot's defaults for SmolVLA (modeling_smolvla.py: queries and values of the expert, and the
 projections of states, actions and times) with rank, alpha and rate of its guide to adapters
-(huggingface.co/docs/lerobot/peft_training): 64, 64 and 1e-3, ten times that of full fine-tuning.
+(docs/source/peft_training.mdx of its repository): 64, 64 and 1e-3, ten times that of full
+fine-tuning.
 """
 
 _base_ = "smolvla_libero.py"

@@ -8,6 +8,9 @@ It writes tests/golden/lerobot044_n15.safetensors. Sizes and inputs are those of
 tests/gr00t_sizes.py and tests/test_gr00t_parity.py. The backbone is put together from LeRobot's
 Eagle model with transformers' SigLIP and Qwen3, as its own constructor does; that one would fetch
 a config and insists on flash attention, which a CPU has not.
+
+It computes in float64 and stores float32: two processors' float32 differ by up to 1e-5 of a
+gradient, and so would a file that was computed in float32.
 """
 
 from __future__ import annotations
@@ -135,7 +138,12 @@ class Tiny(nn.Module):
         )
         for name, value in self.state_dict().items():
             value.copy_(torch.from_numpy(fill.weight(name, value.shape)))
-        self.float().eval()
+        self.double().eval()
+
+
+def numbers(name: str, shape: tuple[int, ...]) -> torch.Tensor:
+    """Normal numbers that float32 holds, as float64."""
+    return torch.from_numpy(fill.normal(name, shape)).double()
 
 
 def inputs(padded: bool) -> BatchFeature:
@@ -146,7 +154,7 @@ def inputs(padded: bool) -> BatchFeature:
     mask = torch.ones_like(tokens)
     if padded:
         mask[1, :3] = 0
-    pictures = torch.from_numpy(fill.normal("pictures", (2, 6, 28, 28)))
+    pictures = numbers("pictures", (2, 6, 28, 28))
     return BatchFeature(
         {
             "eagle_input_ids": tokens,
@@ -159,14 +167,14 @@ def inputs(padded: bool) -> BatchFeature:
 
 def batch(padded: bool) -> BatchFeature:
     """What the head gets; ``padded``: the first sample's last two actions are none."""
-    mask = torch.ones(2, 6, 5)
+    mask = torch.ones(2, 6, 5, dtype=torch.float64)
     mask[..., 4] = 0
     if padded:
         mask[0, 4:] = 0
     return BatchFeature(
         {
-            "state": torch.from_numpy(fill.normal("states", (2, 1, 7))),
-            "action": torch.from_numpy(fill.normal("actions", (2, 6, 5))),
+            "state": numbers("states", (2, 1, 7)),
+            "action": numbers("actions", (2, 6, 5)),
             "action_mask": mask,
             "embodiment_id": torch.tensor([2, 0]),
         }
@@ -177,8 +185,8 @@ def results(padded: bool) -> dict[str, torch.Tensor]:
     """Features, loss, gradients and sampled actions."""
     model = Tiny()
     found: dict[str, torch.Tensor] = {}
-    noise = torch.from_numpy(fill.normal("noise", (2, 6, 5)))
-    time = torch.from_numpy(fill.uniform("time", (2,)))
+    noise = numbers("noise", (2, 6, 5))
+    time = torch.from_numpy(fill.uniform("time", (2,))).double()
     seen = model.backbone(inputs(padded))
     found["features"] = seen["backbone_features"].detach()
     with (
@@ -200,7 +208,7 @@ def results(padded: bool) -> dict[str, torch.Tensor]:
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     found = {
-        f"{case}.{name}": value.contiguous()
+        f"{case}.{name}": value.float().contiguous()
         for case, padded in (("even", False), ("padded", True))
         for name, value in results(padded).items()
     }

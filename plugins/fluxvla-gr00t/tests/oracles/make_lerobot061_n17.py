@@ -6,6 +6,9 @@ Run from the repository's root in an environment with LeRobot 0.6.1 and transfor
 
 It writes tests/golden/lerobot061_n17.safetensors. Sizes and inputs are those of
 tests/gr00t_sizes.py and tests/test_gr00t_parity.py.
+
+It computes in float64 and stores float32: two processors' float32 differ by up to 1e-5 of a
+gradient, and so would a file that was computed in float32.
 """
 
 from __future__ import annotations
@@ -121,7 +124,12 @@ def tiny_model() -> torch.nn.Module:
     for name, value in state.items():
         if name != "backbone.model.lm_head.weight":
             value.copy_(torch.from_numpy(fill.weight(name, value.shape)))
-    return model.float().eval()
+    return model.double().eval()
+
+
+def numbers(name: str, shape: tuple[int, ...]) -> torch.Tensor:
+    """Normal numbers that float32 holds, as float64."""
+    return torch.from_numpy(fill.normal(name, shape)).double()
 
 
 def inputs(padded: bool) -> dict[str, torch.Tensor]:
@@ -146,21 +154,21 @@ def inputs(padded: bool) -> dict[str, torch.Tensor]:
     return {
         "input_ids": tokens,
         "attention_mask": mask,
-        "pixel_values": seen["pixel_values"],
+        "pixel_values": seen["pixel_values"].double(),
         "image_grid_thw": seen["image_grid_thw"],
     }
 
 
 def batch(padded: bool) -> BatchFeature:
     """What the head gets; ``padded``: the first sample's last two actions are none."""
-    mask = torch.ones(2, 6, 5)
+    mask = torch.ones(2, 6, 5, dtype=torch.float64)
     mask[..., 4] = 0
     if padded:
         mask[0, 4:] = 0
     return BatchFeature(
         {
-            "state": torch.from_numpy(fill.normal("states", (2, 1, 7))),
-            "action": torch.from_numpy(fill.normal("actions", (2, 6, 5))),
+            "state": numbers("states", (2, 1, 7)),
+            "action": numbers("actions", (2, 6, 5)),
             "action_mask": mask,
             "embodiment_id": torch.tensor([2, 0]),
         }
@@ -171,8 +179,8 @@ def results(padded: bool) -> dict[str, torch.Tensor]:
     """Features, loss, gradients and sampled actions."""
     model = tiny_model()
     found: dict[str, torch.Tensor] = {}
-    noise = torch.from_numpy(fill.normal("noise", (2, 6, 5)))
-    time = torch.from_numpy(fill.uniform("time", (2,)))
+    noise = numbers("noise", (2, 6, 5))
+    time = torch.from_numpy(fill.uniform("time", (2,))).double()
     seen = model.backbone(BatchFeature(inputs(padded)))
     found["features"] = seen["backbone_features"].detach()
     with (
@@ -200,7 +208,7 @@ def batch_to_act() -> BatchFeature:
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     found = {
-        f"{case}.{name}": value.contiguous()
+        f"{case}.{name}": value.float().contiguous()
         for case, padded in (("even", False), ("padded", True))
         for name, value in results(padded).items()
     }

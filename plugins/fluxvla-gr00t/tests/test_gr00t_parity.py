@@ -101,3 +101,15 @@ def test_loss_and_actions_in_float32_are_the_reference_s(version, case):
     known = golden(version, case)
     for name, tensor in computed(version, case == "padded", torch.float32)[1].items():
         assert_equal(tensor, known[name], name)
+
+
+@pytest.mark.parametrize("case", ["even", "padded"])
+def test_in_bf16_n17_differs_no_more_than_the_reference(case):
+    exact, lower = golden("n1.7", case), golden("n1.7", f"bf16.{case}")
+    with torch.autocast("cpu", torch.bfloat16):
+        _, found = computed("n1.7", case == "padded", torch.float32)
+    assert set(found) == set(lower)
+    for name, tensor in found.items():
+        for expected in (exact[name], lower[name]):
+            error = (tensor.float() - expected).abs().max() / expected.abs().max()
+            assert error < 5e-2, f"{name}: {error:.2e}"

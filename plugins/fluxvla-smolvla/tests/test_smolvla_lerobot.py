@@ -112,6 +112,18 @@ def test_it_acts_as_in_lerobot(source, tmp_path, tokenizer, golden, monkeypatch,
     assert stages_of(out, tmp_path / "measured") == DIVIDED
 
 
+def test_in_bf16_it_acts_as_lerobot_does_in_bf16(source, tmp_path, tokenizer, golden, monkeypatch):
+    out = imported(source, tmp_path / "ours", tokenizer)
+    policy = load_policy(out, mixed_precision_dtype="bf16")
+    monkeypatch.setattr(policy, "_noise", noise)
+    for number in (0, 1):
+        found = torch.from_numpy(policy.predict_action(raw_observation(number)))
+        exact, lower = (golden[f"{kind}act.{number}.actions"].double() for kind in ("", "bf16."))
+        assert 0 < relative(lower, exact) < 5e-2
+        assert 0 < relative(found, exact) < 5e-2
+        assert relative(found, lower) < 5e-2
+
+
 def test_a_camera_that_the_robot_lacks_is_as_one_that_is_masked(
     source, tmp_path, tokenizer, monkeypatch, capsys
 ):

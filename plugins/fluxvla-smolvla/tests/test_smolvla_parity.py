@@ -11,6 +11,8 @@ from safetensors.torch import load_file
 
 from .tiny import GOLDEN, HORIZON, VISION, WIDTH, model_batch, relative, tiny_model
 
+NARROW = 5e-2
+"""Of the largest: the gate of bfloat16."""
 CASES = {
     "expert": {},
     "whole": {"train_expert_only": False, "freeze_vision_encoder": False},
@@ -43,6 +45,20 @@ def test_losses_and_gradients(golden, case):
     assert len(stored) >= 6
     for name in stored:
         assert relative(gradients[name], golden[prefix + name]) < 1e-5, name
+
+
+def test_in_bf16_losses_and_gradients_differ_no_more_than_there(golden):
+    model = tiny_model(**CASES["whole"])
+    with torch.autocast("cpu", torch.bfloat16):
+        found = model(**model_batch())
+    found["loss"].backward()
+    assert 0 < relative(golden["bf16.whole.loss"], golden["whole.loss"]) < NARROW
+    for name in ("bf16.whole.loss", "whole.loss"):
+        assert relative(found["loss"].detach(), golden[name]) < NARROW
+    gradients = {published(n): p.grad for n, p in model.named_parameters() if p.grad is not None}
+    norms = torch.stack([gradients[n].norm() for n in sorted(gradients)])
+    for name in ("bf16.whole.norms", "whole.norms"):
+        assert relative(norms, golden[name]) < NARROW
 
 
 def test_what_is_trained_is_what_gets_a_gradient():

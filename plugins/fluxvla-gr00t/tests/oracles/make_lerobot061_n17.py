@@ -8,7 +8,8 @@ It writes tests/golden/lerobot061_n17.safetensors. Sizes and inputs are those of
 tests/gr00t_sizes.py and tests/test_gr00t_parity.py.
 
 It computes in float64 and stores float32: two processors' float32 differ by up to 1e-5 of a
-gradient, and so would a file that was computed in float32.
+gradient, and so would a file that was computed in float32. ``bf16.`` is what it gives in float32
+with autocast to bfloat16.
 """
 
 from __future__ import annotations
@@ -199,6 +200,33 @@ def results(padded: bool) -> dict[str, torch.Tensor]:
     return found
 
 
+def lowered(padded: bool) -> dict[str, torch.Tensor]:
+    """Features, loss and sampled actions by autocast to bfloat16."""
+    model = tiny_model().float()
+    noise = numbers("noise", (2, 6, 5)).float()
+    time = torch.from_numpy(fill.uniform("time", (2,)))
+    seen, given, asked = (
+        BatchFeature({name: _float(value) for name, value in table.items()})
+        for table in (inputs(padded), batch(padded), batch_to_act())
+    )
+    with (
+        torch.no_grad(),
+        torch.autocast("cpu", torch.bfloat16),
+        mock.patch.object(torch, "randn", return_value=noise),
+        mock.patch.object(model.action_head, "sample_time", return_value=time),
+    ):
+        features = model.backbone(seen)
+        found = {"features": features["backbone_features"]}
+        found["loss"] = model.action_head(features, given)["loss"]
+        actions = model.action_head.get_action(model.backbone(seen), asked)
+        found["actions"] = actions["action_pred"]
+    return found
+
+
+def _float(value: torch.Tensor) -> torch.Tensor:
+    return value.float() if value.is_floating_point() else value
+
+
 def batch_to_act() -> BatchFeature:
     """What the head gets to act."""
     full = batch(False)
@@ -212,6 +240,9 @@ def main(folder: Path) -> None:
         for case, padded in (("even", False), ("padded", True))
         for name, value in results(padded).items()
     }
+    for case, padded in (("even", False), ("padded", True)):
+        for name, value in lowered(padded).items():
+            found[f"bf16.{case}.{name}"] = value.float().contiguous()
     about = {name: version(name) for name in ("lerobot", "transformers", "torch", "diffusers")}
     folder.mkdir(parents=True, exist_ok=True)
     save_file(found, folder / "lerobot061_n17.safetensors", about)

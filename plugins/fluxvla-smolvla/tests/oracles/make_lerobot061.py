@@ -8,6 +8,9 @@ it). FOLDER gets ``smolvla.safetensors`` (results) and the small files of what L
 ``save_pretrained`` writes of the policy; its weights follow from their names by ``fill.weight``.
 
 LeRobot asks the hub for the sizes of SmolVLM2 and for its tokenizer; here it is given small ones.
+
+``bf16.`` is what it computes in bfloat16: losses and gradients by autocast, as it trains, and
+actions with its vision-language model in bfloat16, as it loads that one from the hub.
 """
 
 from __future__ import annotations
@@ -170,8 +173,15 @@ def train_once(name: str, policy: SmolVLAPolicy, results: dict[str, torch.Tensor
             results[f"{name}.gradient.{parameter}"] = gradient.clone()
 
 
+def narrow(policy: SmolVLAPolicy) -> SmolVLAPolicy:
+    """``policy`` with the vision-language model in bfloat16, and nothing else."""
+    policy.model.vlm_with_expert.vlm.to(torch.bfloat16)
+    return policy
+
+
 def act(policy: SmolVLAPolicy, folder: Path, results: dict[str, torch.Tensor]) -> None:
     """Raw observations to joint commands, through LeRobot's processors."""
+    lower = narrow(make_policy(empty_cameras=1).eval())
     byte_tokenizer(folder / "tokenizer")
     policy.config.vlm_model_name = str(folder / "tokenizer")
     before, after = make_smolvla_pre_post_processors(policy.config, make_statistics())
@@ -200,6 +210,8 @@ def act(policy: SmolVLAPolicy, folder: Path, results: dict[str, torch.Tensor]) -
         actions = policy.predict_action_chunk(prepared, noise_of(1))
         results[f"act.{number}.normalized"] = actions[0]
         results[f"act.{number}.actions"] = after(actions)[0]
+        actions = lower.predict_action_chunk(prepared, noise_of(1))
+        results[f"bf16.act.{number}.actions"] = after(actions)[0].float()
     save_folder(policy, folder, before, after)
 
 
@@ -219,6 +231,10 @@ def main() -> None:
     train_once("expert", make_policy(), results)
     whole = make_policy(train_expert_only=False, freeze_vision_encoder=False)
     train_once("whole", whole, results)
+    lower: dict[str, torch.Tensor] = {}
+    with torch.autocast("cpu", torch.bfloat16):
+        train_once("whole", whole, lower)
+    results |= {f"bf16.{name}": lower[name].float() for name in ("whole.loss", "whole.norms")}
     sparse = make_policy(attention_mode="self_attn", num_expert_layers=2)
     train_once("sparse", sparse, results)
     with tempfile.TemporaryDirectory() as place:

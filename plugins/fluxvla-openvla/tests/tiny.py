@@ -1,4 +1,4 @@
-"""The models of ``oracles/make_openvla.py``, made here and filled by the same published names."""
+"""The models of ``oracles/make_openvla*.py``, made here and filled by the same published names."""
 
 from __future__ import annotations
 

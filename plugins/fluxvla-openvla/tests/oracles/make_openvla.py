@@ -1,29 +1,23 @@
-"""Golden files from the authors' own code of OpenVLA and OpenVLA-OFT; and their tensors' names.
+"""Golden files from the authors' own code of OpenVLA; and its tensors' names.
 
-In an environment with torch 2.13.0, timm 0.9.16, torchvision 0.28.0 (its compiled part is not
-needed), transformers 4.40.1, tokenizers 0.19.1, diffusers, safetensors and pillow, with a copy of
-each repository:
+From the repository's root, in an environment with that code (``tools/oracle_env.py``):
 
-    git clone https://github.com/openvla/openvla             (c8f03f4)
-    git clone https://github.com/moojink/openvla-oft         (213c5ff)
-    git clone https://github.com/moojink/transformers-openvla-oft   (bc339d9)
+    OMP_NUM_THREADS=1 PYTHONPATH=. $(python -m tools.oracle_env openvla) \\
+        plugins/fluxvla-openvla/tests/oracles/make_openvla.py [FOLDER]
 
-    PYTHONPATH=. python plugins/fluxvla-openvla/tests/oracles/make_openvla.py openvla openvla
-    (the same with processor, or names, instead of openvla)
-    PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py oft openvla-oft
-    PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py film openvla-oft
-    PYTHONPATH=.:transformers-openvla-oft/src python … make_openvla.py diffusion openvla-oft
-
-from the root of this repository. The models are tiny, but for the vocabulary, in which the code has
-fixed numbers. Every tensor is filled from its published name, so that no weights are stored.
+The models are tiny, but for the vocabulary, in which the code has fixed numbers. Every tensor is
+filled from its published name, so that no weights are stored. ``--names`` instead of FOLDER writes
+names and shapes of the full-size model to ``tests/keys``. ``bf16.`` is what it gives by autocast to
+bfloat16.
 """
 
 from __future__ import annotations
 
-import argparse
+import importlib.util
 import json
 import sys
 import types
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +26,7 @@ from safetensors.numpy import save_file
 
 from tests.oracles import fill
 
+ENVIRONMENT = "openvla"
 HERE = Path(__file__).parent
 DINO = {"embed_dim": 32, "depth": 3, "num_heads": 2, "mlp_ratio": 2.0}
 SIGLIP = {"embed_dim": 48, "depth": 3, "num_heads": 3, "mlp_ratio": 2.0}
@@ -44,51 +39,54 @@ LLAMA = {
     "pad_token_id": 32000,
 }
 IMAGE, PATCHES = 28, 4
-PARTS = ("openvla", "oft", "film", "diffusion", "processor")
 LENGTHS = (9, 6)
-GRADIENTS = {
-    "openvla": (
-        "vision_backbone.featurizer.blocks.0.ls1.scale_factor",
-        "vision_backbone.fused_featurizer.patch_embed.proj.bias",
-        "projector.fc2.bias",
-        "language_model.model.layers.0.mlp.up_proj.weight",
-        "language_model.model.layers.1.self_attn.q_proj.weight",
-        "language_model.model.norm.weight",
-    ),
-    "action_head": ("model.fc1.bias", "model.mlp_resnet_blocks.1.ffn.1.weight"),
-    "proprio_projector": ("fc1.weight",),
-    "film": ("vision_backbone.featurizer.blocks.1.scale.bias",),
-}
+GRADIENTS = (
+    "vision_backbone.featurizer.blocks.0.ls1.scale_factor",
+    "vision_backbone.fused_featurizer.patch_embed.proj.bias",
+    "projector.fc2.bias",
+    "language_model.model.layers.0.mlp.up_proj.weight",
+    "language_model.model.layers.1.self_attn.q_proj.weight",
+    "language_model.model.norm.weight",
+)
 
 
 def main() -> None:
-    """Write one golden file."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("which", choices=(*PARTS, "names", "film_names"))
-    parser.add_argument("repository", type=Path)
-    options = parser.parse_args()
-    sys.argv = sys.argv[:1]
-    torch.manual_seed(0)
-    torch.set_num_threads(1)
-    _make_importable(options.repository)
-    if options.which.endswith("names"):
-        {"names": _write_names, "film_names": _write_film_names}[options.which]()
+    """Write the golden files, or the names."""
+    folder, names = asked()
+    if names:
+        _write_names()
         return
-    arrays = globals()[options.which]()
+    write(folder, {"openvla": openvla, "processor": processor})
+
+
+def asked() -> tuple[Path, bool]:
+    """The folder for golden files, and whether names are to be written instead.
+
+    The code that runs here reads the command line, too.
+    """
+    words, sys.argv = sys.argv[1:], sys.argv[:1]
+    _make_importable()
+    torch.set_num_threads(1)
+    names = "--names" in words
+    return Path(words[0]) if words and not names else HERE.parent / "golden", names
+
+
+def write(folder: Path, parts: Mapping[str, Callable[[], Mapping[str, np.ndarray]]]) -> None:
+    """Write a golden file of each of ``parts``."""
     import timm
     import transformers
 
     versions = {"torch": torch.__version__, "timm": timm.__version__}
     versions["transformers"] = transformers.__version__
-    file = HERE.parent / "golden" / f"{options.which}.safetensors"
-    save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, file, versions)
-    for name, array in arrays.items():
-        print(name, array.shape, float(np.abs(array).mean()))
+    for name, compute in parts.items():
+        torch.manual_seed(0)
+        arrays = {key: np.ascontiguousarray(array) for key, array in compute().items()}
+        save_file(arrays, folder / f"{name}.safetensors", versions)
 
 
 def openvla() -> dict[str, np.ndarray]:
     """Token loss, its gradients and a decoded action."""
-    model = _vla()
+    model = tiny_vla()
     ids, masks = prompts()
     images, actions = pictures(1), fill.uniform("actions", (2, 7), -1.2, 1.2)
     edges = np.linspace(-1, 1, 256)
@@ -100,15 +98,19 @@ def openvla() -> dict[str, np.ndarray]:
         labels.append(torch.tensor([*[-100] * len(real), *action, 2]))
     pad = torch.nn.utils.rnn.pad_sequence
     batch = pad(rows, batch_first=True, padding_value=32000)
-    output = model(
-        input_ids=batch,
-        attention_mask=batch.ne(32000),
-        pixel_values=images,
-        labels=pad(labels, batch_first=True, padding_value=-100),
-    )
-    output.loss.backward()
-    found = {"loss": output.loss.detach().numpy()[None]}
-    found |= _gradients(model, GRADIENTS["openvla"], "")
+    given = {
+        "input_ids": batch,
+        "attention_mask": batch.ne(32000),
+        "pixel_values": images,
+        "labels": pad(labels, batch_first=True, padding_value=-100),
+    }
+    loss = model(**given).loss
+    loss.backward()
+    found = {"loss": loss.detach().numpy()[None]}
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        found["bf16.loss"] = model(**given).loss.float().numpy()[None]
+        found["bf16.features"] = model.vision_backbone(images).float().numpy()
+    found |= gradients_of(model, GRADIENTS, "")
     model.norm_stats = {"unit": {"action": {"q01": [-1.0] * 7, "q99": [1.0] * 7}}}
     with torch.no_grad():
         # Only actions' tokens are ever likely, as in a trained model.
@@ -128,21 +130,6 @@ def openvla() -> dict[str, np.ndarray]:
     return found
 
 
-def oft() -> dict[str, np.ndarray]:
-    """L1 loss with the state and two images; gradients and predicted chunks."""
-    return _oft(film=False, diffuse=False)
-
-
-def film() -> dict[str, np.ndarray]:
-    """The same with FiLM."""
-    return _oft(film=True, diffuse=False)
-
-
-def diffusion() -> dict[str, np.ndarray]:
-    """The same with the diffusion head, in 50 and in 10 steps."""
-    return _oft(film=False, diffuse=True)
-
-
 def processor() -> dict[str, np.ndarray]:
     """An image through the published processor, to 28 pixels instead of 224."""
     from PIL import Image
@@ -158,98 +145,6 @@ def processor() -> dict[str, np.ndarray]:
     )
     picture = Image.fromarray(fill.integers("picture", (48, 64, 3), 256).astype(np.uint8))
     return {"pixel_values": made.apply_transform(picture).numpy()}
-
-
-def _oft(film: bool, diffuse: bool) -> dict[str, np.ndarray]:
-    from prismatic.models import action_heads, projectors
-    from prismatic.models.film_vit_wrapper import FiLMedPrismaticVisionBackbone
-
-    model = _vla()
-    if film:
-        model.vision_backbone = FiLMedPrismaticVisionBackbone(model.vision_backbone, 32)
-    model.vision_backbone.set_num_images_in_input(2)
-    kind = action_heads.DiffusionActionHead if diffuse else action_heads.L1RegressionActionHead
-    head = kind(input_dim=32, hidden_dim=32, action_dim=7)
-    state = projectors.ProprioProjector(32, 8)
-    noisy = projectors.NoisyActionProjector(32) if diffuse else None
-    for part, prefix in ((model, ""), (head, "action_head."), (state, "proprio_projector.")):
-        _fill(part, prefix)
-    if noisy is not None:
-        _fill(noisy, "noisy_action_projector.")
-    ids, masks = prompts()
-    images = pictures(2)
-    actions = torch.from_numpy(fill.uniform("actions", (2, 8, 7), -1.0, 1.0))
-    states = torch.from_numpy(fill.uniform("states", (2, 8), -1.0, 1.0))
-    noise = torch.from_numpy(fill.normal("noise", (2, 8, 7)))
-    steps = torch.tensor([3, 41])
-    losses, chunks, quick = [], [], []
-    # One by one: in a batch its FiLM averages padding, too.
-    for row in range(2):
-        real = ids[row][masks[row]]
-        batch = torch.tensor([*real, *[31900] * 56, 2])[None]
-        labels = torch.tensor([*[-100] * len(real), *[31900] * 56, 2])[None]
-        extra = {}
-        if diffuse:
-            noised = head.noise_scheduler.add_noise(
-                actions[row : row + 1], noise[row : row + 1], steps[row : row + 1]
-            )
-            extra = {
-                "noisy_actions": noised,
-                "noisy_action_projector": noisy,
-                "diffusion_timestep_embeddings": head.time_encoder(steps[row : row + 1])[:, None],
-            }
-        output = model(
-            input_ids=batch,
-            attention_mask=torch.ones_like(batch),
-            pixel_values=images[row : row + 1],
-            labels=labels,
-            output_hidden_states=True,
-            proprio=states[row : row + 1],
-            proprio_projector=state,
-            use_film=film,
-            **extra,
-        )
-        front = 2 * PATCHES + 1 + diffuse
-        text = output.hidden_states[-1][:, front:-1]
-        chosen = text[:, (labels[:, 1:] > 31743)[0]]
-        if diffuse:
-            losses.append((head.predict_noise(chosen) - noise[row : row + 1]).square().mean())
-        else:
-            losses.append((head.predict_action(chosen) - actions[row : row + 1]).abs().mean())
-        model.norm_stats = {"unit": {"action": {k: [s] * 7 for k, s in UNIT.items()}}}
-        for taken, count in ((chunks, 50), (quick, 10)):
-            if diffuse:
-                head.noise_scheduler.set_timesteps(count)
-            drawn, normal = noise[row : row + 1], torch.randn
-            torch.randn = lambda *_, drawn=drawn, **__: drawn
-            with torch.no_grad():
-                chunk, _ = model.predict_action(
-                    torch.tensor(real)[None],
-                    pixel_values=images[row : row + 1],
-                    attention_mask=torch.ones(1, len(real), dtype=torch.long),
-                    proprio=states[row].numpy(),
-                    proprio_projector=state,
-                    action_head=head,
-                    noisy_action_projector=noisy,
-                    use_film=film,
-                )
-            torch.randn = normal
-            taken.append(chunk)
-    loss = torch.stack(losses).mean()
-    loss.backward()
-    found = {"loss": loss.detach().numpy()[None], "losses": torch.stack(losses).detach().numpy()}
-    names = GRADIENTS["openvla"] if not film else GRADIENTS["film"]
-    found |= _gradients(model.vision_backbone if film else model, names, "")
-    found |= _gradients(state, GRADIENTS["proprio_projector"], "proprio_projector.")
-    if not diffuse:
-        found |= _gradients(head, GRADIENTS["action_head"], "action_head.")
-    found["predicted"] = np.stack(chunks).astype(np.float32)
-    if diffuse:
-        found["predicted in 10 steps"] = np.stack(quick).astype(np.float32)
-    return found
-
-
-UNIT = {"q01": -1.0, "q99": 1.0, "min": -1.0, "max": 1.0}
 
 
 def prompts() -> tuple[np.ndarray, np.ndarray]:
@@ -271,7 +166,7 @@ def pictures(count: int) -> torch.Tensor:
     return torch.from_numpy(both.reshape(2, 6 * count, IMAGE, IMAGE).astype(np.float32))
 
 
-def _vla() -> torch.nn.Module:
+def tiny_vla() -> torch.nn.Module:
     import timm
     from prismatic.extern.hf.configuration_prismatic import OpenVLAConfig
     from prismatic.extern.hf.modeling_prismatic import OpenVLAForActionPrediction
@@ -284,17 +179,19 @@ def _vla() -> torch.nn.Module:
     config._attn_implementation = "sdpa"
     model = OpenVLAForActionPrediction(config).eval()
     timm.create_model = create
-    _fill(model, "")
+    fill_by_name(model, "")
     return model
 
 
-def _fill(part: torch.nn.Module, prefix: str) -> None:
+def fill_by_name(part: torch.nn.Module, prefix: str) -> None:
     with torch.no_grad():
         for name, tensor in part.state_dict().items():
             tensor.copy_(torch.from_numpy(fill.weight(prefix + name, tensor.shape)))
 
 
-def _gradients(part: torch.nn.Module, names: tuple[str, ...], prefix: str) -> dict[str, np.ndarray]:
+def gradients_of(
+    part: torch.nn.Module, names: tuple[str, ...], prefix: str
+) -> dict[str, np.ndarray]:
     parameters = dict(part.named_parameters())
     return {f"gradient {prefix}{name}": parameters[name].grad.numpy() for name in names}
 
@@ -316,29 +213,12 @@ def _write_names() -> None:
     print(len(shapes), sum(int(np.prod(shape)) for shape in shapes.values()))
 
 
-def _write_film_names() -> None:
-    """Names and shapes of the tiny model's ``vision_backbone--…``, with peft 0.11.1."""
-    from peft import LoraConfig, get_peft_model
-    from prismatic.models.film_vit_wrapper import FiLMedPrismaticVisionBackbone
-
-    settings = LoraConfig(
-        r=32,
-        lora_alpha=16,
-        lora_dropout=0.0,
-        target_modules="all-linear",
-        init_lora_weights="gaussian",
-    )
-    model = get_peft_model(_vla(), settings)
-    wrapped = FiLMedPrismaticVisionBackbone(model.vision_backbone, 32)
-    shapes = {name: list(tensor.shape) for name, tensor in wrapped.state_dict().items()}
-    lines = ",\n".join(f"{json.dumps(name)}: {shape}" for name, shape in shapes.items())
-    (HERE.parent / "keys" / "openvla-oft-film-tiny.json").write_text(f"{{\n{lines}\n}}\n")
-    print(len(shapes))
-
-
-def _make_importable(repository: Path) -> None:
+def _make_importable() -> None:
     """Its packages without their ``__init__``, which import all of its training."""
-    root = repository / "prismatic"
+    found = importlib.util.find_spec("prismatic")
+    assert found is not None
+    assert found.origin is not None
+    root = Path(found.origin).parent
     for name in ("", ".extern", ".extern.hf", ".models", ".training", ".vla", ".util"):
         module = types.ModuleType(f"prismatic{name}")
         module.__path__ = [str(root.joinpath(*name.split(".")[1:]))]

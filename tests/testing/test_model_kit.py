@@ -17,12 +17,14 @@ import numpy as np
 import torch
 from torch import nn
 from fluxvla_core import VLA, VLAS
+from fluxvla_core.models import InputSizes
 from fluxvla_core.testing import ModelConformance
 
 @VLAS.register_module()
 class Specimen(VLA, nn.Module):
     api = "1.0"
     action_shape = (4, 3)
+    input_sizes = InputSizes(states=5, actions=3, horizon=4)
     def __init__(self, width: int = 16):
         super().__init__()
         self.enter = nn.Linear(5, width)
@@ -63,6 +65,14 @@ GRADIENTS = (
     "the_batch_belongs_to_the_caller", "what_it_learns_is_in_its_state_dict", "it_trains_in_bf16",
 )  # fmt: skip
 FAULTS = {
+    "another width": Fault(
+        "the_sizes_that_it_declares_are_those_that_it_takes", "states=5", "states=6",
+        "Specimen: the width of states is 6, in the data it is 5",
+    ),
+    "another chunk": Fault(
+        "the_sizes_that_it_declares_are_those_that_it_takes", "horizon=4", "horizon=3",
+        "the number of actions in a chunk is 3, in the data it is 4",
+    ),
     "no version": Fault("is_complete", '    api = "1.0"\n', "", "the version of the contract"),
     "another key": Fault(
         "forward_gives_a_loss", LOSS, LOSS.replace('"loss"', '"cost"'),
@@ -195,7 +205,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Outcomes:
 
 
 def test_a_right_model_passes_every_check(found: Outcomes) -> None:
-    check_good(found, checks=14)
+    check_good(found, checks=15)
 
 
 @pytest.mark.parametrize("name", FAULTS)

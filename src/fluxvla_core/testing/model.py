@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA
 from fluxvla_core.testing._conformance import Conformance, calling, capability, equal, numbers
+from fluxvla_core.training.input_sizes import chunk_of, declared_sizes, misfits
 
 _CLOSE = 1e-4
 _REPEATS = 2
@@ -241,6 +242,19 @@ class ModelConformance(Conformance):
 
     def _may_rest(self, name: str) -> bool:
         return any(name.startswith(beginning) for beginning in self.unused)
+
+    def test_the_sizes_that_it_declares_are_those_that_it_takes(self, model: nn.Module) -> None:
+        table = {"type": self.component(), **self.arguments}
+        declared = declared_sizes(table)
+        capability(bool(declared), "input_sizes would let data that do not fit be refused earlier")
+        wrong = [one.text for one in misfits(table, self.batch(model), declared)]
+        chunk, shape = chunk_of(declared), VLA.adapt(model).action_shape
+        if chunk is not None and shape is not None and chunk != tuple(shape):
+            wrong.append(f"{self.entry_point}: chunks are {chunk}, action_shape is {tuple(shape)}")
+        assert not wrong, (
+            f"input_sizes does not say what forward() takes: {'; '.join(wrong)}, expected the "
+            "sizes of this kit's batch: data that fit would be refused"
+        )
 
     def test_it_learns_one_batch(self, model: nn.Module) -> None:
         losses = self.trained(model, self.steps)

@@ -78,9 +78,10 @@ def declared_sizes(table: Any) -> dict[str, Declared]:
     if not isinstance(table, Mapping):
         return {}  # a model that is built already
     cls = class_of(table.get("type"), VLAS)
-    stated, found = getattr(cls, "input_sizes", None), {}
+    stated = getattr(cls, "input_sizes", None)
+    found: dict[str, Declared] = {}
     if not isinstance(stated, InputSizes):
-        return {}
+        return found
     for field in fields(InputSizes):
         one = _read(cls, table, getattr(stated, field.name))
         if one is not None:

@@ -65,11 +65,11 @@ GRADIENTS = (
     "the_batch_belongs_to_the_caller", "what_it_learns_is_in_its_state_dict", "it_trains_in_bf16",
 )  # fmt: skip
 FAULTS = {
-    "another width": Fault(
+    "another declared width": Fault(
         "the_sizes_that_it_declares_are_those_that_it_takes", "states=5", "states=6",
         "Specimen: the width of states is 6, in the data it is 5",
     ),
-    "another chunk": Fault(
+    "another declared chunk": Fault(
         "the_sizes_that_it_declares_are_those_that_it_takes", "horizon=4", "horizon=3",
         "the number of actions in a chunk is 3, in the data it is 4",
     ),

@@ -63,20 +63,22 @@ MISFITS = [
 
 
 @pytest.fixture
-def never_built(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Lets the constructor of a config's model raise."""
+def built(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Gets a config; the list that it returns then has the models of that class that are built."""
 
-    def forbid(config: Path) -> None:
-        cls = VLAS.get(load_config(config).tree["model"]["type"])
+    def watch(config: Path) -> list[str]:
+        cls, calls = VLAS.get(load_config(config).tree["model"]["type"]), []
         init = cls.__dict__["__init__"]
 
         @wraps(init)
-        def refuse(self: Any, *arguments: Any, **keywords: Any) -> None:
-            raise AssertionError(f"{cls.__name__} was built")
+        def count(self: Any, *arguments: Any, **keywords: Any) -> None:
+            calls.append(cls.__name__)
+            init(self, *arguments, **keywords)
 
-        monkeypatch.setattr(cls, "__init__", refuse)
+        monkeypatch.setattr(cls, "__init__", count)
+        return calls
 
-    return forbid
+    return watch
 
 
 @pytest.mark.parametrize(("family", "change", "words"), MISFITS)
@@ -86,33 +88,66 @@ def test_data_that_do_not_fit(
     words: str,
     data: Path,
     tmp_path: Path,
-    never_built: Any,
+    built: Any,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     config = tiny(family, tmp_path, data)
-    never_built(config)
+    calls = built(config)
     command = ["run", "--config", str(config), "--section", "runner", "--set", change]
     for more in (["--work-dir", str(tmp_path / "work")], ["--dry-run"]):
         assert main([*command, *more]) == 2
         assert words in capsys.readouterr().err
+    assert not calls
     assert not (tmp_path / "work").exists()
 
 
+def test_a_prompt_for_other_cameras(
+    data: Path, tmp_path: Path, built: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny("gr00t_n15", tmp_path, data)
+    calls = built(config)
+    command = ["run", "--config", str(config), "--section", "runner", "--set", ONE_CAMERA]
+    assert main([*command, "--work-dir", str(tmp_path / "work")]) == 2
+    assert "num_images is 2, the sample has 1 images" in capsys.readouterr().err
+    assert not calls
+
+
+@pytest.mark.timeout(300)
+def test_weights_of_another_family(
+    data: Path, tmp_path: Path, built: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("act", "diffusion"):
+        (tmp_path / name).mkdir()
+    other = tiny("act", tmp_path / "act", data)
+    command = ["run", "--section", "runner", "--set", "runner.max_steps=2"]
+    assert main([*command, "--config", str(other), "--work-dir", str(tmp_path / "other")]) == 0
+    config = tiny("diffusion", tmp_path / "diffusion", data)
+    calls = built(config)
+    command = ["run", "--config", str(config), "--section", "runner"]
+    for key in ("runner.init_from", "model.pretrained_name_or_path"):
+        for more in (["--work-dir", str(tmp_path / "work")], ["--dry-run"]):
+            assert main([*command, *more, "--set", f"{key}={tmp_path / 'other'}"]) == 2
+            said = capsys.readouterr().err
+            assert "the checkpoint is of ACT, the config's model is DiffusionPolicy" in said
+    assert not calls
+
+
 def test_all_that_does_not_fit_is_listed_at_once(
-    data: Path, tmp_path: Path, never_built: Any, capsys: pytest.CaptureFixture[str]
+    data: Path, tmp_path: Path, built: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tiny("act", tmp_path, data)
-    never_built(config)
+    calls = built(config)
     changes = [word for change in (WINDOW, ONE_CAMERA) for word in ("--set", change)]
     assert main(["run", "--config", str(config), "--section", "runner", "--dry-run", *changes]) == 2
     said = capsys.readouterr().err
+    assert not calls
     assert "2 problems in the config" in said
     assert CAMERAS in said
     assert CHUNK.format(8) in said
 
 
 def test_images_that_no_transform_normalises(
-    data: Path, tmp_path: Path, never_built: Any, capsys: pytest.CaptureFixture[str]
+    data: Path, tmp_path: Path, built: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tiny("act", tmp_path, data)
     tree = load_config(config).tree
@@ -121,7 +156,7 @@ def test_images_that_no_transform_normalises(
     assert len(kept) < len(table["transforms"])
     table["transforms"] = kept
     config.write_text("".join(f"{name} = {value!r}\n" for name, value in tree.items()))
-    never_built(config)
+    calls = built(config)
     assert main(["run", "--config", str(config), "--section", "runner", "--dry-run"]) == 2
     assert (
         "ACT: images are normalised floats, in the data they are uint8" in capsys.readouterr().err

@@ -33,7 +33,7 @@ class Seeing:
         raise AssertionError("it was built")
 
 
-class BaseSized(VLA):
+class BaseSized(VLA, torch.nn.Module):
     input_sizes = InputSizes(
         cameras="vision_backbone.num_cameras | vlm_backbone.num_cameras",
         image_size=("side", lambda side: side * 2),
@@ -58,7 +58,7 @@ class Sized(BaseSized):
         super().__init__(**kwargs)
 
 
-class Unsized:
+class Unsized(torch.nn.Module):
     def __init__(self):
         raise AssertionError("it was built")
 

@@ -67,7 +67,7 @@ GRADIENTS = (
 FAULTS = {
     "another declared width": Fault(
         "the_sizes_that_it_declares_are_those_that_it_takes", "states=5", "states=6",
-        "Specimen: the width of states is 6, in the data it is 5",
+        "the width of states is 6, in the data it is 5",
     ),
     "another declared chunk": Fault(
         "the_sizes_that_it_declares_are_those_that_it_takes", "horizon=4", "horizon=3",

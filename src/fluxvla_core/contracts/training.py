@@ -37,7 +37,7 @@ class PartWeights:
     unread: Sequence[str] = ()
 
 
-Size = int | str | tuple[str, Callable[[Any], Any]] | None
+Size = int | tuple[int, int] | str | tuple[str, Callable[[Any], Any]] | None
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,8 @@ class InputSizes:
 
     Data, robots and checkpoints are compared with them before a model is built. Each is the name of
     an argument (``vla_head.horizon``: of the table ``vla_head``; ``a | b``: of the one that is
-    set), a number, or such a name and a function of the value. None is any size, also as a value.
+    set), a number or two, or such a name and a function of the value. None is any size, also as a
+    value.
 
     Args:
         cameras: images of an observation.

@@ -17,7 +17,6 @@ import numpy as np
 from fluxvla_core.build import RunContext, class_of
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
 from fluxvla_core.config.resolve import SLOTS
-from fluxvla_core.config.tree import join_key
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA, Dataset, InputSizes, Size
 from fluxvla_core.data.sampler import SampleKey
@@ -129,7 +128,7 @@ def refusal(found: Sequence[Misfit], context: RunContext) -> ConfigError:
     """The error about all of ``found``, each with the line of the config that says the size."""
     problems = []
     for one in found:
-        key = join_key("model", one.key) if one.key else "model"
+        key = f"model.{one.key}" if one.key else "model"
         place = context.origins.get(key) or context.origins.get("model", "")
         problems.append(Problem(place, key, one.text))
     return ConfigError.from_problems(tuple(problems), next=advice(found))
@@ -279,7 +278,7 @@ def _parts(dataset: Any) -> Iterator[Dataset]:
         yield from _parts(part)
     if not described.datasets:
         uncached = getattr(dataset, "uncached", None)
-        yield described if uncached is None else uncached()
+        yield described if uncached is None else Dataset.adapt(uncached())
 
 
 def _related(theirs: str, ours: str) -> bool:
@@ -296,9 +295,12 @@ def _related(theirs: str, ours: str) -> bool:
 def _read(cls: type, table: Mapping[str, Any], stated: Size) -> Declared | None:
     if stated is None or stated is False:
         return None
-    if isinstance(stated, int):
+    names: Any = stated
+    function: Any = None
+    if isinstance(stated, tuple):
+        names, function = stated
+    if not isinstance(names, str):
         return Declared("", stated)
-    names, function = (stated, None) if isinstance(stated, str) else stated
     for name in names.split(" | "):
         try:
             value = _argument(cls, table, name)

@@ -216,7 +216,6 @@ PRISMATIC = (
     "regex",
     "requests",
     "safetensors",
-    "timm==0.9.16",
     "tokenizers==0.19.1",
 )
 JAX = (
@@ -293,13 +292,13 @@ def prepare_openpi_jax(log: Callable[[str], None]) -> Env:
 def prepare_openvla(log: Callable[[str], None]) -> Env:
     """The code of OpenVLA, with the transformers that it was made for."""
     needs = (*PRISMATIC, "transformers==4.40.1")
-    return prepare_sources(log, "openvla", needs, [OPENVLA], finish=_torchvision)
+    return prepare_sources(log, "openvla", needs, [OPENVLA], finish=_vision)
 
 
 def prepare_openvla_oft(log: Callable[[str], None]) -> Env:
     """The code of OpenVLA-OFT, with its own transformers."""
     sources = [OPENVLA_OFT, OFT_TRANSFORMERS]
-    return prepare_sources(log, "openvla_oft", PRISMATIC, sources, finish=_torchvision)
+    return prepare_sources(log, "openvla_oft", PRISMATIC, sources, finish=_vision)
 
 
 def prepare_tensorflow(log: Callable[[str], None]) -> Env:
@@ -309,9 +308,12 @@ def prepare_tensorflow(log: Callable[[str], None]) -> Env:
     )
 
 
-def _torchvision(env: Env) -> None:
-    """torchvision without its compiled part, which is for another build of torch."""
-    env.pip_install("--no-deps", "torchvision==0.28.0", quiet=True)
+def _vision(env: Env) -> None:
+    """timm, and torchvision without its compiled part, which is for another build of torch.
+
+    With their requirements pip would replace torch by that other build.
+    """
+    env.pip_install("--no-deps", "timm==0.9.16", "torchvision==0.28.0", quiet=True)
     lerobot_env.declare_operators(env)
 
 

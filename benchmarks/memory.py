@@ -22,7 +22,7 @@ from benchmarks import _results
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.config.load import load_config
 from fluxvla_core.training.cost import NOTHING, Kept, footprint, optimizer_bytes
-from fluxvla_core.training.rehearsal import kept_of, rehearse
+from fluxvla_core.training.dry_run import dry_run, kept_of
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 BATCH = 8
@@ -128,9 +128,9 @@ def of_family(family: Family, activations: bool = True) -> dict[str, Any]:
 def _of_config(
     tree: dict[str, Any], columns: Sequence[Strategy], activations: bool
 ) -> tuple[dict[str, Any], int, int]:
-    rehearsed = rehearse(_context(tree, columns[0]), processes=())
-    model, batch = rehearsed.skeleton, rehearsed.inputs
-    assert model is not None, rehearsed.notes
+    built = dry_run(_context(tree, columns[0]), processes=())
+    model, batch = built.skeleton, built.inputs
+    assert model is not None, built.notes
     kept: dict[Any, Kept | None] = {}
     found = {}
     for column in columns:
@@ -146,7 +146,7 @@ def _of_config(
         if kept[key] is None:
             told["activations"] = told["total"] = None
         found[column.title] = told
-    return found, rehearsed.trained, rehearsed.parameters
+    return found, built.trained, built.parameters
 
 
 def _kept(model: nn.Module, layout: Any, runner: Any, batch: Any) -> Kept | None:

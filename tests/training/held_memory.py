@@ -11,8 +11,8 @@ from torch import Tensor
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg, build_vla_from_cfg
 from fluxvla_core.training.cost import optimizer_bytes
-from fluxvla_core.training.model import ForwardArguments
 from fluxvla_core.training.dry_run import kept_of
+from fluxvla_core.training.model import ForwardArguments
 
 
 def check_held(work_dir: Path, config: Mapping[str, Any], samples: Any, per_process: int) -> None:

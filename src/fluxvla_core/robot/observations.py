@@ -220,8 +220,8 @@ class FreshnessGate:
     """Checks receipt age and skew of an observation's streams, and that none runs backwards.
 
     Args:
-        max_age_s: how old the newest reading of any stream may be.
-        max_skew_s: how far the streams may be apart.
+        max_age_s: ``safety.max_age_s``: how old the newest reading of any stream may be.
+        max_skew_s: ``safety.max_skew_s``: how far the receipt times may be apart.
     """
 
     def __init__(self, max_age_s: float, max_skew_s: float) -> None:

@@ -74,13 +74,13 @@ def test_times_of_steps_and_images_and_memory_are_those_of_finished_episodes():
 
 def test_ticks_of_live_episodes_are_summed():
     live = {"status": "done", "steps": 30, "ticks": 28, "missed_ticks": 6, "late_ticks": 1}
-    live |= {"skipped_beats": 2, "trips": ["starvation", "later"]}
+    live |= {"skipped_ticks": 2, "trips": ["starvation", "later"]}
     found = results_file.ticks([live, {**live, "trips": []}, {"status": "error"}])
     assert found == {
         "ticks": 56,
         "missed_ticks": 12,
         "missed_share": 0.2,
-        "skipped_beats": 4,
+        "skipped_ticks": 4,
         "late_ticks": 2,
         "stopped_by": {"starvation": 1},
     }

@@ -92,7 +92,7 @@ def test_what_is_read_back_is_what_happened(bench):
         index = found.images["front"].newest(at)
         np.testing.assert_array_equal(found.images["front"].read(index), asked["images"]["front"])
     summary = json.loads((found.path / "episode.json").read_text())
-    assert summary.pop("dropped") == {"frames": 0, "pictures": 0, "events": 0}
+    assert summary.pop("dropped") == {"frames": 0, "images": 0, "events": 0}
     assert summary == found.summary()
 
 
@@ -220,7 +220,7 @@ def test_what_is_not_written_in_time_is_dropped_and_said(bench, monkeypatch):
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
     assert "images were not recorded: the disk or the processor did not keep up" in line
     summary = json.loads((bench.work_dir / "rec/001-1/episode.json").read_text())
-    assert summary["dropped"]["pictures"] > 0
+    assert summary["dropped"]["images"] > 0
 
 
 class Tapped:
@@ -246,7 +246,7 @@ def test_images_that_nobody_looked_at_are_recorded_where_the_robot_keeps_them(be
 
     times = np.diff(found.images["front"].times)
     arrived = np.count_nonzero(times > 1e-3)  # what was looked at lies in between
-    lost = json.loads((found.path / "episode.json").read_text())["dropped"]["pictures"]
+    lost = json.loads((found.path / "episode.json").read_text())["dropped"]["images"]
     assert found.native
     assert arrived + lost > 20
     assert (found.path / "front.mp4").stat().st_size > 0

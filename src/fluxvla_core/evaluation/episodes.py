@@ -36,6 +36,8 @@ POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
 FORMAT = "fluxvla-episodes-2"
 FORMER = "fluxvla-episodes-1"
 """Without the code."""
+_FORMER_KEYS = {"skipped_beats": "skipped_ticks", "pictures": "images"}
+"""Keys of records of version 0.1, under which they are still read."""
 LARGEST_LOG = 1 << 30
 """Bytes of an evaluation log, of some 500 an episode."""
 
@@ -348,7 +350,9 @@ def _parsed(line: str) -> dict[str, Any] | None:
         value = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return value if isinstance(value, dict) and ("format" in value or _is_episode(value)) else None
+    if not isinstance(value, dict) or not ("format" in value or _is_episode(value)):
+        return None
+    return {_FORMER_KEYS.get(key, key): entry for key, entry in value.items()}
 
 
 def _is_episode(record: Mapping[str, Any]) -> bool:

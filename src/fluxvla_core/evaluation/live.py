@@ -259,7 +259,7 @@ def run_live(
     Returns:
         JSON values: ``success``, ``outcome``, ``problem`` (of a safety stop), ``steps`` (commands
         that were sent), ``ticks``, ``missed_ticks`` (those at which the policy had no target),
-        ``skipped_beats`` and ``late_ticks`` (of the machine), ``calls``, ``trips``,
+        ``skipped_ticks`` and ``late_ticks`` (of the machine), ``calls``, ``trips``,
         ``instruction``, ``record`` (the episode's folder) and ``timing``.
 
     Raises:
@@ -311,8 +311,8 @@ def run_live(
         "calls": summary["chunks"],
         "ticks": operator.ticks,
         "late_ticks": operator.late,
-        "missed_ticks": summary["held_beats"],
-        "skipped_beats": summary["skipped_beats"],
+        "missed_ticks": summary["held_ticks"],
+        "skipped_ticks": summary["skipped_ticks"],
         "trips": [trip["rule"] for trip in summary["trips"]],
         "instruction": task.instruction,
         "record": str(runner.recorder.folder.relative_to(live.folder)),

@@ -149,7 +149,7 @@ class EpisodeWorker:
         record["timing"]["memory_mb"] = memory_mb()
         if cameras:
             sizes = {camera.name: [camera.height, camera.width] for camera in cameras}
-            record["pictures"] = {"sizes": sizes, "by": self.environment.drawn_by()}
+            record["images"] = {"sizes": sizes, "by": self.environment.drawn_by()}
         return record
 
     def actor(self, group: str) -> tuple[Actor, tuple[Camera, ...]]:

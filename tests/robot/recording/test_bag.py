@@ -259,7 +259,7 @@ def test_events_beyond_the_limit_are_counted(
     monkeypatch.setattr("fluxvla_core.robot.recording.trace._WAITING_EVENTS", 0)
     trace = EpisodeTrace(tmp_path / "e", None)
     trace.write({"event": "start", "t": 0.0})
-    assert trace.close({})["dropped"] == {"frames": 0, "pictures": 0, "events": 1}
+    assert trace.close({})["dropped"] == {"frames": 0, "images": 0, "events": 1}
 
 
 def test_images_that_a_robot_lost_before_they_were_asked_for_are_counted(tmp_path: Path) -> None:
@@ -275,5 +275,5 @@ def test_images_that_a_robot_lost_before_they_were_asked_for_are_counted(tmp_pat
     while len(asked) < 3:
         time.sleep(0.01)
     summary = trace.close({})
-    assert summary["dropped"]["pictures"] == 2 * (len(asked) - 1)
+    assert summary["dropped"]["images"] == 2 * (len(asked) - 1)
     assert len(open_recording(tmp_path / "e").images[CAMERA]) == len(asked)

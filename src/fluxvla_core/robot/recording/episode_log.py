@@ -157,8 +157,9 @@ class EpisodeSummary:
             "joints": [joint.get("name") for joint in embodiment.get("joints", ())],
             "rate_hz": start.get("rate_hz"),
             "lockstep": start.get("lockstep"),
-            "skipped_beats": end.get("skipped_beats"),
-            "held_beats": self._held,
+            # Version 0.1 wrote ``skipped_beats`` and ``held_beats``.
+            "skipped_ticks": end.get("skipped_ticks", end.get("skipped_beats")),
+            "held_ticks": self._held,
             "clamps": self._clamps,
             "late_filters": self._late_filters,
             "trips": end.get("trips", []),

@@ -48,7 +48,7 @@ def logged(event: CommandSent | FilterLeftOut | Stopped | EpisodeEnded) -> dict[
                 "outcome": outcome,
                 "success": success,
                 "problem": problem,
-                "skipped_beats": skipped,
+                "skipped_ticks": skipped,
                 "trips": [asdict(trip) for trip in trips],
             }
 

@@ -160,10 +160,7 @@ class EpisodeRecorder(EpisodeObserver):
         self.summary = self._counted.to_dict()
         try:
             self.summary = self._trace.close(self.summary)
-            # The file's key is older than the word that everything else uses.
-            words = {"pictures": "images"}
-            dropped = self._trace.dropped.items()
-            lost = [f"{count} {words.get(what, what)}" for what, count in dropped if count]
+            lost = [f"{count} {kind}" for kind, count in self._trace.dropped.items() if count]
             if lost:
                 self.reporter.warn(
                     f"{' and '.join(lost)} were not recorded: "

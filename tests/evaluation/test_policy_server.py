@@ -178,4 +178,4 @@ def test_rows_that_depend_on_their_company_are_refused():
     check_rows(Batched(1, leaks=True))
     with pytest.raises(ConfigError, match="batch_size = 3: on cpu a row's result depends on") as e:
         PolicyServer({"policy": lambda: Batched(leaks=True)})
-    assert "--set eval.batch_size=1, or another size" in str(e.value)
+    assert "--set <section>.batch_size=1, or another size" in str(e.value)

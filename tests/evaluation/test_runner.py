@@ -277,7 +277,7 @@ def test_episodes_of_other_code_are_asked_for_and_never_silently_counted(
     load_plugin_files([path])
     with pytest.raises(UsageError, match=r"run with other code: source code \w+ -> \w+") as caught:
         evaluate(tmp_path, **options, reporter=listener)
-    assert "--set eval.reuse=true to count them" in str(caught.value)
+    assert "--set <section>.reuse=true to count them" in str(caught.value)
     assert (tmp_path / "eval" / "results.json").read_text() == before
 
     evaluate(tmp_path, **{**options, "episodes": 3}, reuse=True, reporter=listener)

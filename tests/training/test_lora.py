@@ -239,7 +239,7 @@ def test_a_run_that_goes_on_names_the_base_that_it_had(tmp_path, base, monkeypat
         assert torch.equal(acts.encoder.weight, plain.encoder.weight)
 
 
-def test_what_a_model_brings_itself_is_no_base(tmp_path):
+def test_weights_from_a_package_are_no_base(tmp_path):
     left_out = {"sources": {"": "package:words 1.0"}, "sha256": "0"}
     with CheckpointWriter(tmp_path, 1, 0) as writer:
         writer.write_json(lora.CONFIG, LoraOptions.read(LORA, None).for_peft())
@@ -258,7 +258,7 @@ def test_going_on_with_another_base_names_both(tmp_path, base):
     assert (
         f"was trained with (the model from {now}; then from {before})\n"
         "  likely cause: init_from was changed, or that place has other weights by now\n"
-        f"  next: --set runner.init_from=DIR, where the weights of {before} are; or resume "
+        f"  next: --set <section>.init_from=DIR, where the weights of {before} are; or resume "
         "without it"
     ) in str(caught.value)
     shutil.copytree(base, tmp_path / "copy")
@@ -291,7 +291,7 @@ def test_with_and_without_an_adapter_are_two_models(tmp_path, base):
     with pytest.raises(CheckpointError) as caught:
         run(tmp_path, "auto", init_from=str(base))
     assert caught.value.what == "lora is not set, the checkpoint's run had rank=2, alpha=4"
-    assert "begin another run from these weights: --set runner.init_from=" in str(caught.value)
+    assert "begin another run from these weights: --set '<section>.init_from=" in str(caught.value)
     other = {**LORA, "rank": 3, "target_modules": ["head", "linear"]}
     with pytest.raises(CheckpointError) as caught:
         run(tmp_path, "auto", init_from=str(base), lora=other)

@@ -13,7 +13,7 @@ from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import PartWeights
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.testing.training import TinyDataset, tiny_config
-from fluxvla_core.training.weights import put_parts, tensors_at
+from fluxvla_core.training.part_weights import put_parts, tensors_at
 
 NAMES = {"tower.": "vision.model."}
 

@@ -184,8 +184,8 @@ def test_averages_are_not_dropped_without_a_word(tmp_path):
         f"{tmp_path}/checkpoints/step-000000002: ema_decay is not set, and the checkpoint's run "
         "kept averaged weights, which are used for inference\n"
         "  next: set it back: the checkpoint's config.resolved.json has its value; or begin "
-        "another run from these weights: --set runner.init_from="
-        f"{tmp_path}/checkpoints/step-000000002 --work-dir OTHER"
+        "another run from these weights: --set '<section>.init_from="
+        f"{tmp_path}/checkpoints/step-000000002' --work-dir OTHER"
     )
 
 

@@ -5,7 +5,7 @@ and a robot that reads an embodiment use the same door as the trainer.
 
     <work_dir>/checkpoints/step-000000100/
         manifest.json            sizes and SHA-256 of everything below
-        model.safetensors        weights and buffers, but for frozen ones that the model brings
+        model.safetensors        weights and buffers, but for frozen ones that the model loads
         ema.safetensors          averaged weights, when they are kept
         adapter/                 what LoRA trains, as peft has it, instead of in the model's file
         optimizer.safetensors    optimizer state by parameter name; where ranks hold parts of it,

@@ -66,7 +66,7 @@ def read(place: str | Path, group: str = "policy") -> Evaluated:
         raise UsageError(
             f"the evaluation in {folder} is of another checkpoint",
             where=str(checkpoint),
-            next="evaluate this one: --set eval.ckpt_path=… --work-dir OTHER",
+            next="evaluate this one: --set <section>.ckpt_path=… --work-dir OTHER",
         )
     done = [r for r in found if r.get("status") == DONE and r["group"] == group]
     if not done:

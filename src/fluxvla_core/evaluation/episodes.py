@@ -280,7 +280,7 @@ class EvalLog:
                 where=str(path),
                 cause="a library, a plugin or FluxVLA itself was changed since",
                 next="another --work-dir, or delete the file, to run all of them again; "
-                "--set eval.reuse=true to count them together with the new ones",
+                "--set <section>.reuse=true to count them together with the new ones",
             )
         return code
 

@@ -272,7 +272,7 @@ def run_live(
         raise ConfigError(
             f"{environment.spec.name} takes no joint targets, so a robot's limits cannot be "
             "applied to its actions; live evaluation always applies them",
-            next="evaluate it stepped: --set eval.live=false",
+            next="evaluate it stepped: --set <section>.live=false",
         )
     folder = Path(live.folder) / name
     shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was cut short

@@ -274,7 +274,7 @@ def check_rows(policy: LocalPolicy) -> None:
                 f"batch_size = {most}: on {policy.device} a row's result depends on the others "
                 "in its batch, so episodes could not be repeated",
                 cause="the device sums rows of one batch in different orders",
-                next="--set eval.batch_size=1, or another size",
+                next="--set <section>.batch_size=1, or another size",
             )
 
 

@@ -163,8 +163,9 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.training import lora
         from fluxvla_core.training.cost import Meter
         from fluxvla_core.training.model import checkpoint_activations, compile_units
+        from fluxvla_core.training.part_weights import put_parts
         from fluxvla_core.training.state import seed_all
-        from fluxvla_core.training.weights import base_to_note, put_parts, start_training_from
+        from fluxvla_core.training.weights import base_to_note, start_training_from
 
         # For a ``run_setup`` that calls this method alone.
         self._join()

@@ -41,7 +41,7 @@ from fluxvla_core.training.state import (
     seeds_of,
     set_rng_state,
 )
-from fluxvla_core.training.weights import LeftOut, SavedWeights, check_model_tensors
+from fluxvla_core.training.weights import ExternalWeights, SavedWeights, check_model_tensors
 
 AUTO = "auto"
 
@@ -102,19 +102,21 @@ def _newest(context: RunContext) -> Checkpoint | None:
 
 
 def load_weights(
-    checkpoint: Checkpoint, model: nn.Module, brings: LeftOut | None
+    checkpoint: Checkpoint, model: nn.Module, external: ExternalWeights | None
 ) -> dict[str, Tensor]:
     """The checkpoint's weights by name; all fit ``model``.
 
     Args:
-        brings: the frozen weights that the model brings itself.
+        external: the frozen weights that the model's constructor loaded.
 
     Raises:
         CheckpointError: they are another model's, or other frozen weights go with them.
     """
     tensors = checkpoint.tensors(MODEL) | adapter_tensors(model, checkpoint)
     saved = checkpoint.json(TRAINER, SavedWeights)["left_out"]
-    check_model_tensors(model, tensors, brings or LeftOut(), saved, str(checkpoint.path))
+    check_model_tensors(
+        model, tensors, external or ExternalWeights(), saved, str(checkpoint.path), resuming=True
+    )
     return tensors
 
 
@@ -263,7 +265,7 @@ def _listed(seeds: Sequence[int | None]) -> str:
 
 
 def _begin_another(checkpoint: str) -> str:
-    weights = shlex.quote(f"runner.init_from={checkpoint}")
+    weights = shlex.quote(f"<section>.init_from={checkpoint}")
     return f"begin another run from these weights: --set {weights} --work-dir OTHER"
 
 

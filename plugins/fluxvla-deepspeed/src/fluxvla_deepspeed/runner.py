@@ -79,7 +79,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
 
     def _build_optimizer(self) -> torch.optim.Optimizer:
         """The config's optimizer; from here on its groups hold ZeRO's flat parts."""
-        from fluxvla_core.training import left_out
+        from fluxvla_core.training import external_weights
         from fluxvla_deepspeed.engine import start
 
         inner = super()._build_optimizer()
@@ -87,7 +87,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         names = {id(p): name for name, p in model.named_parameters()}
         self._groups = [[names[id(p)] for p in g["params"]] for g in inner.param_groups]
         # Stage 3 splits frozen weights as well: so they are hashed before that.
-        self.left_out = left_out(model)
+        self.external_weights = external_weights(model)
         self.vla = start(
             model, inner, self.zero_stage, self.max_grad_norm, self.compute_dtype, self.world
         )

@@ -185,7 +185,7 @@ def _check_taken(table: dict[str, Any], above: list[str], name: str, key: str, t
 
 
 def _meant(text: str, key: str, unit: str = "") -> str:
-    """The key that was meant, with the value given, or with ``unit`` if that means another thing."""
+    """The key that was meant: with the value given, or with ``unit`` where that is another one."""
     if unit:
         return f"; did you mean --set {key}=… ({unit})?"
     return f"; did you mean {_as_set(text, key, '=')}?"

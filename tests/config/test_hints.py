@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.config.overrides import complete, whole_options
+from fluxvla_core.config.overrides import complete, complete_hints
 from fluxvla_core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,10 +39,10 @@ def test_a_hint_gets_the_keys_of_the_tables(hint, whole):
 
 
 def test_an_error_that_passes_is_completed():
-    with pytest.raises(ConfigError) as caught, whole_options(CONFIG):
+    with pytest.raises(ConfigError) as caught, complete_hints(CONFIG):
         raise ConfigError("too narrow", next="--set <Pad>.width=3")
     assert caught.value.next == "--set train.transforms.1.width=3"
-    with pytest.raises(ConfigError) as caught, whole_options(CONFIG):
+    with pytest.raises(ConfigError) as caught, complete_hints(CONFIG):
         raise ConfigError("too narrow", next="--set <section>.width=3")
     assert caught.value.next == "--set <section>.width=3", "no section runs"
 

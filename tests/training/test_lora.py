@@ -22,7 +22,12 @@ from fluxvla_core.testing.training import (
 from fluxvla_core.training import lora
 from fluxvla_core.training.export import export
 from fluxvla_core.training.lora import LoraOptions
-from fluxvla_core.training.weights import base_of, base_to_note, load_for_inference, start_from
+from fluxvla_core.training.weights import (
+    adapter_base_place,
+    adapter_base_to_record,
+    load_for_inference,
+    load_initial_weights,
+)
 
 pytest.importorskip("peft")
 
@@ -104,7 +109,7 @@ def test_it_goes_on_bit_for_bit(tmp_path, base):
 def test_the_base_is_another_runs_weights(tmp_path, base):
     run(tmp_path, init_from=str(base), lora=LORA, max_steps=1)
     started = TinyVLA()
-    start_from(started, base)
+    load_initial_weights(started, base)
     acts = TinyVLA()
     load_for_inference(acts, latest(tmp_path))
     assert torch.equal(acts.encoder.weight, started.encoder.weight)
@@ -120,7 +125,7 @@ def test_peft_reads_the_adapter_and_agrees_with_the_merged_model(tmp_path, base)
     found = latest(tmp_path)
     merged, plain = TinyVLA(), TinyVLA()
     load_for_inference(merged, found)
-    start_from(plain, base)
+    load_initial_weights(plain, base)
     assert set(merged.state_dict()) == set(plain.state_dict())
     assert [p.requires_grad for p in merged.parameters()] == [
         p.requires_grad for p in plain.parameters()
@@ -230,7 +235,7 @@ def test_a_run_that_goes_on_names_the_base_that_it_had(tmp_path, base, monkeypat
     run("other", "auto", **settings, init_from="base", max_steps=6)
     monkeypatch.chdir((tmp_path / "here").rename(tmp_path / "there"))
     plain = TinyVLA()
-    start_from(plain, "base")
+    load_initial_weights(plain, "base")
     for place, step in (("run", 4), ("other", 6)):
         found, acts = latest(place), TinyVLA()
         assert found.step == step
@@ -245,8 +250,8 @@ def test_weights_from_a_package_are_no_base(tmp_path):
         writer.write_json(lora.CONFIG, LoraOptions.read(LORA, None).for_peft())
         writer.write_json("trainer.json", {"left_out": left_out})
         found = Checkpoint.open(writer.commit())
-    assert base_of(found) is base_of(found, "elsewhere") is None
-    assert base_to_note(found, None) is base_to_note(found, "elsewhere") is None
+    assert adapter_base_place(found) is adapter_base_place(found, "elsewhere") is None
+    assert adapter_base_to_record(found, None) is adapter_base_to_record(found, "elsewhere") is None
 
 
 def test_going_on_with_another_base_names_both(tmp_path, base):
@@ -327,9 +332,9 @@ def test_a_safetensors_file_to_start_from(tmp_path, base):
     load_for_inference(model, latest(base))
     assert torch.equal(runner.model.head.weight, model.head.weight)
     with pytest.raises(CheckpointError, match=r"there are no weights at .*gone\.safetensors"):
-        start_from(model, tmp_path / "gone.safetensors")
+        load_initial_weights(model, tmp_path / "gone.safetensors")
     with pytest.raises(CheckpointError, match="the weights of the checkpoint are not this model's"):
-        start_from(TinyVLA(width=16), latest(base).path / "model.safetensors")
+        load_initial_weights(TinyVLA(width=16), latest(base).path / "model.safetensors")
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from fluxvla_models.pretrained_backbones import (
 )
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.training.part_weights import put_parts
+from fluxvla_core.training.part_weights import load_part_weights
 
 from .llava_parts import HEAD, folders, halves
 
@@ -129,7 +129,7 @@ def test_weights_come_under_other_names(folders: dict[str, str]) -> None:
     place = {"pretrained_name_or_path": folders["qwen3"], "name_mapping": mapping}
     model = new(folders, **place, strict_mapping=False)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    put_parts(model, model.part_weights)
+    load_part_weights(model, model.part_weights)
     theirs = halves(folders).llm_backbone.state_dict()
     for name, tensor in model.state_dict().items():
         part, _, rest = name.partition(".")
@@ -138,10 +138,10 @@ def test_weights_come_under_other_names(folders: dict[str, str]) -> None:
     assert model.pretrained_name_or_path is None
     strict = new(folders, **place)
     with pytest.raises(CheckpointError, match=r"1 left over: lm_head\.weight"):
-        put_parts(strict, strict.part_weights)
+        load_part_weights(strict, strict.part_weights)
     wrong = new(folders, **{**place, "name_mapping": {"llm_backbone.": "model."}})
     with pytest.raises(CheckpointError, match=r"missing: model\.model\.embed_tokens\.weight"):
-        put_parts(wrong, wrong.part_weights)
+        load_part_weights(wrong, wrong.part_weights)
 
 
 def test_names_of_no_place_are_refused(folders: dict[str, str]) -> None:

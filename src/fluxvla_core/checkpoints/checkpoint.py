@@ -286,7 +286,7 @@ def refuse_existing(work_dir: Path) -> None:
 def latest(place: str | Path) -> Checkpoint | None:
     """The newest checkpoint of a work dir, None when there is none yet.
 
-    Only its manifest is read. Loading a policy and ``--resume auto`` use :func:`newest_whole`,
+    Only its manifest is read. Loading a policy and ``--resume auto`` use :func:`newest_undamaged`,
     which verifies every file and passes over a damaged checkpoint.
 
     Raises:
@@ -296,7 +296,7 @@ def latest(place: str | Path) -> Checkpoint | None:
     return Checkpoint.open(found[-1]) if found else None
 
 
-def newest_whole(place: str | Path) -> tuple[Checkpoint | None, list[CheckpointError]]:
+def newest_undamaged(place: str | Path) -> tuple[Checkpoint | None, list[CheckpointError]]:
     """The newest checkpoint that passes :meth:`Checkpoint.verify`, and why newer ones do not."""
     refused: list[CheckpointError] = []
     for folder in reversed(folders(place)):

@@ -208,7 +208,7 @@ _SECTION = "section"
 
 
 @contextmanager
-def whole_options(config: Mapping[str, Any], section: str = "") -> Iterator[None]:
+def complete_hints(config: Mapping[str, Any], section: str = "") -> Iterator[None]:
     """Complete the hint of an error that is raised inside.
 
     Args:

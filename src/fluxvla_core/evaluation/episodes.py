@@ -234,7 +234,7 @@ class EvalLog:
         for path in sorted(self.path.parent.glob(self._other_logs)) if self._other_logs else []:
             if path == self.path:
                 continue
-            records = whole_lines(read_log(path))
+            records = complete_lines(read_log(path))
             if records and self._is_mine(records[0]):
                 self._take(records, path)
 
@@ -242,7 +242,7 @@ class EvalLog:
         data = read_log(self.path)
         # A crash can leave the last line cut short; it was never reported as finished.
         whole = data[: data.rfind(b"\n") + 1]
-        records = whole_lines(whole)
+        records = complete_lines(whole)
         if not records or not self._is_mine(records[0]):
             self._move_aside(data)
             return
@@ -337,7 +337,7 @@ def read_log(path: Path) -> bytes:
     return read_bytes(path, UsageError, at_most=LARGEST_LOG)
 
 
-def whole_lines(data: bytes) -> list[dict[str, Any]]:
+def complete_lines(data: bytes) -> list[dict[str, Any]]:
     """Headers and episodes of a log; a header, or an empty one, comes first. What is neither is
     left out, as is a last line that was cut short: those episodes were not finished."""
     whole = data[: data.rfind(b"\n") + 1].decode("utf-8", "replace")

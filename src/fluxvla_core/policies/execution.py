@@ -52,7 +52,7 @@ Function = Callable[[Tensors], Tensors]
 WARM_UP = 3
 
 
-class Recorded(Protocol):
+class CapturedFunction(Protocol):
     """A function that was recorded with fixed memory."""
 
     @property
@@ -70,7 +70,7 @@ class Recorded(Protocol):
         """
 
 
-Record = Callable[[Function, Tensors], Recorded]
+Record = Callable[[Function, Tensors], CapturedFunction]
 """Records a function with inputs as :func:`static` gives them, or another recording's outputs."""
 
 
@@ -222,7 +222,9 @@ class Graphed(Compiled):
             )
         super().__init__(model)
         self._record = record
-        self._recorded: OrderedDict[Any, tuple[Recorded | None, Recorded]] = OrderedDict()
+        self._recorded: OrderedDict[Any, tuple[CapturedFunction | None, CapturedFunction]] = (
+            OrderedDict()
+        )
 
     def answer(self, batch: Batch, clock: Clock) -> Tensor:
         assert self.parts is not None
@@ -248,7 +250,9 @@ class Graphed(Compiled):
         seen: Tensors = self.model.observe(**observation)
         return seen
 
-    def _new(self, observation: Tensors, noise: Tensor) -> tuple[Recorded | None, Recorded]:
+    def _new(
+        self, observation: Tensors, noise: Tensor
+    ) -> tuple[CapturedFunction | None, CapturedFunction]:
         """Record ``observe``, if the model allows it, and ``denoise``, which reads its memory."""
         tables = self.tables()
 

@@ -27,12 +27,12 @@ from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
 from fluxvla_core.training.cost import (
-    NOTHING,
+    NO_ACTIVATIONS,
     Footprint,
-    Kept,
+    SavedActivations,
     fake,
+    fake_activations,
     footprint,
-    kept_by_fake,
     optimizer_bytes,
 )
 from fluxvla_core.training.lora import LoraOptions
@@ -149,13 +149,15 @@ def memory_of(
         Exception: what a model raises that decides by the values of its inputs.
     """
     options = runner.options
-    by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], Kept] = {}
+    by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], SavedActivations] = {}
     footprints = {}
     for count in processes:
         layout = runner.memory_layout(model, count, device_type)
         lowered = tuple(layout.gathered_as.items())
         if lowered not in by_dtypes:
-            by_dtypes[lowered] = NOTHING if batch is None else kept_of(model, layout, runner, batch)
+            by_dtypes[lowered] = (
+                NO_ACTIVATIONS if batch is None else activations_of(model, layout, runner, batch)
+            )
         footprints[count] = footprint(
             layout,
             by_dtypes[lowered],
@@ -166,10 +168,12 @@ def memory_of(
     return footprints
 
 
-def kept_of(model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]) -> Kept:
+def activations_of(
+    model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]
+) -> SavedActivations:
     """What a batch leaves for the backward pass; arguments as of :func:`memory_of`."""
     arguments = ForwardArguments(model)(batch)
-    return kept_by_fake(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
+    return fake_activations(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
 
 
 def _count(

@@ -24,7 +24,7 @@ _INSIDE = ("model", "state_dict")
 """Keys under which a file may have its table of tensors."""
 
 
-def put_parts(model: nn.Module, parts: Sequence[PartWeights]) -> None:
+def load_part_weights(model: nn.Module, parts: Sequence[PartWeights]) -> None:
     """Give parts of a freshly built ``model`` their published weights.
 
     Raises:
@@ -41,7 +41,7 @@ def matched(
     """``tensors`` under the names of ``wanted``, as far as ``part`` names them.
 
     Raises:
-        CheckpointError: as ``put_parts``.
+        CheckpointError: as ``load_part_weights``.
     """
     source_names = {name: other for name in wanted if (other := _other_name(name, part.names))}
     if not source_names:

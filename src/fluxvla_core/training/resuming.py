@@ -22,7 +22,7 @@ from fluxvla_core.checkpoints.checkpoint import (
     Checkpoint,
     clear_leftovers,
     name_best,
-    newest_whole,
+    newest_undamaged,
     refuse_existing,
     set_aside_later,
 )
@@ -91,7 +91,7 @@ def _choose(context: RunContext, resume: str | None, first: str | None) -> str:
 
 
 def _newest(context: RunContext) -> Checkpoint | None:
-    checkpoint, refused = newest_whole(context.work_dir)
+    checkpoint, refused = newest_undamaged(context.work_dir)
     if checkpoint is None and refused:
         raise refused[0]
     for error in refused:

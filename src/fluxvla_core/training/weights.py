@@ -195,9 +195,9 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     options = lora.LoraOptions.of_checkpoint(checkpoint)
     trained = {name: p.requires_grad for name, p in model.named_parameters()}
     if options is not None:
-        base = base_of(checkpoint)
+        base = adapter_base_place(checkpoint)
         if base is not None:
-            start_from(model, base)
+            load_initial_weights(model, base)
             set_frozen_source(model, base)
         lora.attach(model, options, trained=True)
     tensors = checkpoint.tensors(MODEL) | lora.adapter_tensors(model, checkpoint)
@@ -222,7 +222,7 @@ def _by_all_names(model: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, 
     return {**tensors, **others}
 
 
-def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
+def adapter_base_place(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
     """Where the base weights of a checkpoint's adapter are; None if it needs none.
 
     They are where they were found, or else, as folders are moved together, at the place that was
@@ -231,7 +231,7 @@ def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
     Args:
         init_from: the place that is asked for now, which goes first when it is a new one.
     """
-    noted = _noted_base(checkpoint)
+    noted = _recorded_adapter_base(checkpoint)
     if noted is None:
         return None
     asked, found = noted
@@ -240,7 +240,7 @@ def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
     return next((place for place in (found, asked) if Path(place).exists()), found)
 
 
-def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None:
+def adapter_base_to_record(before: Checkpoint | None, init_from: str | None) -> str | None:
     """Where the base of an adapter was asked for; None if its checkpoints need no others' weights.
 
     Args:
@@ -248,11 +248,11 @@ def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None
     """
     if before is None:
         return init_from
-    noted = _noted_base(before)
+    noted = _recorded_adapter_base(before)
     return None if noted is None else init_from or noted[0]
 
 
-def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
+def _recorded_adapter_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
     """Where a checkpoint's base was asked for, and found."""
     if not checkpoint.has(lora.CONFIG):
         return None
@@ -261,7 +261,7 @@ def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
     return None if asked is None or found is None else (asked, found)
 
 
-def exact_place(place: str | Path) -> str:
+def resolve_weights(place: str | Path) -> str:
     """The safetensors file or the checkpoint's own folder that ``place`` means at this moment.
 
     Which one is a work dir's newest, or its ``best``, changes while that run continues.
@@ -275,7 +275,7 @@ def exact_place(place: str | Path) -> str:
     return str(path if path.suffix == ".safetensors" else Checkpoint.open(path).path)
 
 
-def start_from(model: nn.Module, place: str | Path) -> Path:
+def load_initial_weights(model: nn.Module, place: str | Path) -> Path:
     """Give a freshly built ``model`` the weights of another training, or of an export.
 
     Args:
@@ -312,7 +312,7 @@ def _put_all(model: nn.Module, tensors: Mapping[str, Tensor | Stored], path: Pat
     return path
 
 
-def start_training_from(
+def start_training_with(
     model: nn.Module, init_from: str | None, before: Checkpoint | None, adapter: bool, world: World
 ) -> None:
     """Give a freshly built ``model`` the weights that ``init_from`` names, if any.
@@ -321,11 +321,11 @@ def start_training_from(
         before: what the run resumes from: all weights are in it, but for an adapter's base.
         adapter: the model is an adapter's base, whose weights are not saved.
     """
-    place = base_of(before, init_from) if before is not None else init_from
+    place = adapter_base_place(before, init_from) if before is not None else init_from
     if place is None:
         return
     # Found once: ranks that looked one after the other could find different ones.
-    found = start_from(model, run_on_rank0(world, lambda: exact_place(place)))
+    found = load_initial_weights(model, run_on_rank0(world, lambda: resolve_weights(place)))
     if adapter:
         set_frozen_source(model, str(found))
 

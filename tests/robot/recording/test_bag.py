@@ -140,7 +140,9 @@ def test_jpegs_need_opencv_to_be_read(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_pictures_is_a_deprecated_name_of_images(folder: Path) -> None:
     recorded, content = open_recording(folder), read_bag(folder / f"{folder.name}.mcap")
-    with pytest.warns(DeprecationWarning, match=r"Recorded.pictures is deprecated, use images"):
+    with pytest.warns(
+        DeprecationWarning, match=r"RecordedEpisode.pictures is deprecated, use images"
+    ):
         assert recorded.pictures is recorded.images
     with pytest.warns(DeprecationWarning, match=r"BagContent.pictures is deprecated, use images"):
         assert content.pictures is content.images

@@ -83,7 +83,7 @@ class RecordedImages:
         return self._unpack(self._file.read(place), kind)
 
 
-class Recorded:
+class RecordedEpisode:
     """One episode. ``open_recording`` makes it.
 
     Args:
@@ -127,7 +127,7 @@ class Recorded:
     @property
     def pictures(self) -> Mapping[str, RecordedImages]:
         """Deprecated name of ``images``."""
-        _renamed("Recorded")
+        _renamed("RecordedEpisode")
         return self.images
 
     @property
@@ -190,7 +190,7 @@ class Recorded:
         return episode_log.summarise(self.events)
 
 
-def open_recording(path: str | Path) -> Recorded:
+def open_recording(path: str | Path) -> RecordedEpisode:
     """Read one recorded episode.
 
     Args:
@@ -314,17 +314,17 @@ def _renamed(owner: str) -> None:
     warnings.warn(message, DeprecationWarning, stacklevel=3)
 
 
-def _read(path: Path) -> Recorded:
+def _read(path: Path) -> RecordedEpisode:
     file = bag_of(path) if path.is_dir() else path
     if file is None:
-        return Recorded(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), images={})
+        return RecordedEpisode(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), images={})
     bag = read_bag(file)
     events, whole = _with_rest(file.parent, bag.events, bag.whole)
-    cameras = Recorded(path, events, whole, {}).embodiment.camera_names
+    cameras = RecordedEpisode(path, events, whole, {}).embodiment.camera_names
     colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.IMAGE_TYPES}
     images = _sorted(bag, colours, bag.unpacker.image)
     depths = _sorted(bag, {ros.depth_topic(c): c for c in cameras}, bag.unpacker.depth)
-    return Recorded(path, events, whole, images, depths)
+    return RecordedEpisode(path, events, whole, images, depths)
 
 
 def _with_rest(folder: Path, events: list[Event], whole: bool) -> tuple[list[Event], bool]:
@@ -371,7 +371,7 @@ def _arrived(event: Event) -> float:
     return float(event["t"]) - (age_at(event, STATE) if "stamps" in event else 0.0)
 
 
-def check_same_embodiment(recordings: Iterable[Recorded]) -> EmbodimentSpec:
+def check_same_embodiment(recordings: Iterable[RecordedEpisode]) -> EmbodimentSpec:
     """The robot that all of them are of.
 
     Raises:

@@ -23,7 +23,7 @@ from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording.recorded import (
     ROUNDING_S,
     Event,
-    Recorded,
+    RecordedEpisode,
     age_at,
     newest_at,
     open_recording,
@@ -65,7 +65,7 @@ class ReplayOperator(Operator):
         self._began = 0.0
 
     @cached_property
-    def recorded(self) -> Recorded:
+    def recorded(self) -> RecordedEpisode:
         """The recording, read when it is first needed.
 
         Raises:
@@ -266,7 +266,7 @@ class ReplayPolicy(Policy):
         self._next = 0
 
     @cached_property
-    def recorded(self) -> Recorded:
+    def recorded(self) -> RecordedEpisode:
         """The recording, read when it is first needed.
 
         Raises:

@@ -73,7 +73,7 @@ def loss_of(model):
 
 
 def test_only_the_adapter_is_trained_and_saved(tmp_path, base):
-    """T2 of the field notes: merged weights were saved, and the adapter was not rotated."""
+    """T2 of upstream's bugs: merged weights were saved, and the adapter was not rotated."""
     runner = run(tmp_path, init_from=str(base), lora=LORA, save_iter_interval=2, max_keep_ckpts=2)
     found = latest(tmp_path)
     assert {n for n in found.manifest.files if n.startswith("adapter/")} == {

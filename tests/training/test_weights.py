@@ -104,7 +104,7 @@ def test_frozen_weights_of_another_version_are_refused(tmp_path):
 
 
 def test_weights_of_another_model_are_refused():
-    """T3 of the field notes: a wrong checkpoint resumed silently."""
+    """T3 of upstream's bugs: a wrong checkpoint resumed silently."""
     model = Model()
     tensors = {**weights_by_name(model), "head.weight": torch.zeros(9, 4)}
     del tensors["scale"]

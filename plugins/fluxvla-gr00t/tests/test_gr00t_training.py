@@ -15,7 +15,7 @@ from fluxvla_core.testing.training import (
     tiny_config,
     train,
 )
-from fluxvla_core.training.cost import fake, fake_activations
+from fluxvla_core.training.cost import fake, fake_activations, saved_activations
 from tests.oracles import fill
 
 from .gr00t_sizes import PLACE, TINY_N15, TINY_N17

@@ -9,7 +9,7 @@ from fluxvla_pi.pi0 import PI0FlowMatching
 from fluxvla_pi.pi05 import PI05FlowMatching
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.training.cost import fake, fake_activations
+from fluxvla_core.training.cost import fake, fake_activations, saved_activations
 
 from .oracles.pi_inputs import ACTIONS, BATCH, HORIZON, SIZES
 from .tiny import acting_batch, model_of, relative, training_batch

@@ -163,6 +163,6 @@ def test_an_evaluation_with_errors_is_not_whole(tmp_path):
 
 
 def test_no_checkpoint_is_said_with_what_to_do(tmp_path):
-    with pytest.raises(CheckpointError, match="no whole checkpoint") as caught:
+    with pytest.raises(CheckpointError, match="no undamaged checkpoint") as caught:
         chosen_checkpoint(None, tmp_path)
     assert "train first" in str(caught.value)

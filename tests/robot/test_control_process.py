@@ -218,7 +218,7 @@ def test_what_only_the_control_process_knew_completes_a_record(tmp_path):
 
     recorded = open_recording(tmp_path)
 
-    assert recorded.whole
+    assert recorded.finished
     np.testing.assert_array_equal(recorded.commands()[0], [0.1, 0.2, 0.3])
     assert recorded.summary()["problem"] == "killed"
 

@@ -30,8 +30,8 @@ def digest(array: np.ndarray[Any, Any]) -> str:
 def test_what_it_is_of(recorded: RecordedEpisode) -> None:
     assert recorded.instruction == EXPECTED["instruction"]
     assert list(recorded.embodiment.joint_names) == EXPECTED["joints"]
-    for name in ("success", "whole", "native"):
-        assert getattr(recorded, name) is EXPECTED[name]
+    for name, key in (("success", "success"), ("finished", "whole"), ("native", "native")):
+        assert getattr(recorded, name) is EXPECTED[key]
     assert len(recorded.events) == EXPECTED["events"]
 
 
@@ -52,6 +52,7 @@ def test_its_summary_is_counted_anew(recorded: RecordedEpisode) -> None:
     summary = recorded.summary()
     assert summary["outcome"] == EXPECTED["outcome"]
     assert summary["steps"] == EXPECTED["steps"]
+    assert summary["skipped_ticks"] == 0  # it has ``skipped_beats``
 
 
 def test_it_can_be_replayed_as_robot_and_as_policy(bench: Any, recorded: RecordedEpisode) -> None:

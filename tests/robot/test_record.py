@@ -81,7 +81,7 @@ def test_ros_messages_say_which_joints_and_when(bench):
 def test_what_is_read_back_is_what_happened(bench):
     found = recorded(bench, max_publish_step=30)
 
-    assert found.whole
+    assert found.finished
     assert (found.instruction, found.success) == ("wave at the camera", False)
     times, commands = found.commands()
     np.testing.assert_array_equal(commands, bench.arm.sent)
@@ -160,7 +160,7 @@ def test_a_recording_is_whole_after_a_fault_and_has_the_cause(bench, fault, rule
         recorded(bench)
 
     found = open_recording(bench.work_dir / "rec")
-    assert found.whole
+    assert found.finished
     assert found.of("end")[0]["trips"][0]["rule"] == rule
     assert found.summary()["outcome"] == "failed"
     assert len(found.commands()[0]) > 5
@@ -290,16 +290,16 @@ def test_a_recording_is_readable_however_the_process_ends(tmp_path, ending):
     process.communicate(timeout=60)
 
     found = open_recording(record)
-    assert found.whole == (ending != signal.SIGKILL)
+    assert found.finished == (ending != signal.SIGKILL)
     times, commands = found.commands()
     assert len(commands) > 10
     assert len(found.chunks()) > 0
     assert found.images["front"].read(len(found.images["front"]) - 1).shape == (24, 32, 3)
-    outcome = "interrupted" if found.whole else "cut short"
+    outcome = "interrupted" if found.finished else "cut short"
     assert found.summary()["outcome"] == outcome
     assert np.diff(times).max() < 5
 
-    assert finish_recording(found.path) != found.whole
+    assert finish_recording(found.path) != found.finished
     assert open_recording(record).events == found.events
     assert connections(found.path)["/fluxvla/command"][1] == len(commands)
     assert sorted(p.name for p in record.iterdir()) == ["001-1"]

@@ -84,7 +84,7 @@ class _Policy:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One whole checkpoint folder; ``open`` it rather than constructing it."""
+    """A complete checkpoint folder; made by ``Checkpoint.open``."""
 
     path: Path
     manifest: Manifest

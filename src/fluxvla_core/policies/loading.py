@@ -172,7 +172,7 @@ def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
     others = [shlex.quote(str(p)) for p in work_dirs_below(Path()) if folders(p)][:3]
     here = f", such as {' or '.join(others)}" if others else ""
     raise CheckpointError(
-        f"there is no whole checkpoint in {work_dir}" + (f": {damaged}" if damaged else ""),
+        f"there is no undamaged checkpoint in {work_dir}" + (f": {damaged}" if damaged else ""),
         next=f"train first (--section runner), or name the work dir of a training{here}: "
         f"--work-dir {others[0] if others else 'DIR'}",
     )

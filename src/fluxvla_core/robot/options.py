@@ -37,7 +37,7 @@ class InferenceOptions:
     policy: Any = None
     """table or object of the Policy contract, instead of a checkpoint."""
     ckpt_path: str | None = None
-    """checkpoint or work dir; the newest whole one of the work dir by default."""
+    """checkpoint or work dir; the newest undamaged one of the work dir by default."""
     dataset: Any = None
     """instead of what the checkpoint says, see ``load_policy``."""
     denormalize_action: Any = None

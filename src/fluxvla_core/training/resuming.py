@@ -54,7 +54,7 @@ def choose_checkpoint(
     Also clears what killed saves left in the work dir, which is this run's own by now.
 
     Args:
-        resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
+        resume: ``auto`` (the newest undamaged one; a damaged newer one is named and passed over), a
             path (refused if damaged), or None (refused if there are checkpoints already).
         first: a path for ``auto`` where the work dir has no checkpoint yet: a restart before the
             first save starts from where the run did.

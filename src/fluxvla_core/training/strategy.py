@@ -349,7 +349,7 @@ class Strategy(TrainRunner):
         return {"step": self.plan.total_steps(self.max_steps, self.max_epochs) - left}
 
     def _load_model_state(self, state: Mapping[str, Tensor]) -> None:
-        """Put a checkpoint's weights, whole and by name, into the model; all of them fit."""
+        """Load a checkpoint's full tensors, by name, into the model; all of them fit."""
         from fluxvla_core.training.weights import load_full_tensors
 
         load_full_tensors(self.model, state)

@@ -56,7 +56,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_values_come_back_exactly_and_in_order(folder: Path) -> None:
     found = open_recording(folder)
-    assert found.whole
+    assert found.finished
     assert [e["event"] for e in found.events] == ["start"] + ["command"] * 20
     assert found.commands()[1][:, 0].tolist() == [n / 7 for n in range(20)]
     assert found.images[CAMERA].read(7).tolist() == solid(7).tolist()
@@ -146,6 +146,10 @@ def test_pictures_is_a_deprecated_name_of_images(folder: Path) -> None:
         assert recorded.pictures is recorded.images
     with pytest.warns(DeprecationWarning, match=r"BagContent.pictures is deprecated, use images"):
         assert content.pictures is content.images
+    with pytest.warns(DeprecationWarning, match=r"BagContent.whole is deprecated, use finished"):
+        assert content.whole is content.finished
+    with pytest.warns(DeprecationWarning, match=r"Episode.whole is deprecated, use finished"):
+        assert recorded.whole is recorded.finished
 
 
 def test_the_newest_image_by_a_time(folder: Path) -> None:
@@ -167,12 +171,12 @@ def test_what_is_cut_anywhere_is_read_up_to_there_and_can_be_finished(folder: Pa
     bag.write_bytes(content[: len(content) // 2])
     (folder / "metadata.yaml").unlink()
     left = open_recording(folder)
-    assert not left.whole
+    assert not left.finished
 
     assert finish_recording(folder) is True
 
     again = open_recording(folder)
-    assert again.whole
+    assert again.finished
     assert again.events == left.events
     assert json.loads((folder / "episode.json").read_text())["outcome"] == "cut short"
     assert finish_recording(folder) is False
@@ -252,7 +256,7 @@ def test_what_the_robot_cannot_give_hurts_nothing_else(tmp_path: Path) -> None:
     trace = EpisodeTrace(tmp_path / "e", 10.0, Recording(NAMES, (CAMERA,), broken))
     trace.write({**START, "embodiment": SPEC.to_dict()})
     trace.close({})
-    assert open_recording(tmp_path / "e").whole
+    assert open_recording(tmp_path / "e").finished
 
 
 def test_events_beyond_the_limit_are_counted(

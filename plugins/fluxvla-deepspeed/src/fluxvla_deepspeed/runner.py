@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class DeepSpeedTrainRunner(BaseTrainRunner):
     """Training with DeepSpeed's ZeRO, on GPUs over NCCL and on CPUs over gloo.
 
-    Checkpoints are those of every other strategy: whole tensors by parameter name, which another
+    Checkpoints are those of every other strategy: full tensors by parameter name, which another
     runner, or another number of processes, can go on from.
 
     Args:
@@ -47,7 +47,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
             raise ConfigError(
                 "ema_decay does not go together with zero_stage 3",
                 where=self.context.where(f"{self.context.section}.ema_decay"),
-                cause="no process holds whole weights between steps to average",
+                cause="no process holds full weights between steps to average",
                 next="use zero_stage 2, or FSDPTrainRunner, which averages its parts",
             )
         if find_spec("deepspeed") is None:

@@ -89,7 +89,7 @@ class RecordedEpisode:
     Args:
         path: the episode's folder, or its MCAP file.
         events: in the order in which they happened.
-        whole: whether the record was finished.
+        finished: whether the record was finished.
         images: camera -> its images.
         depths: camera -> its depth images, NaN where nothing was measured.
 
@@ -101,7 +101,7 @@ class RecordedEpisode:
         self,
         path: Path,
         events: Sequence[Event],
-        whole: bool,
+        finished: bool,
         images: Mapping[str, RecordedImages],
         depths: Mapping[str, RecordedImages] | None = None,
     ) -> None:
@@ -115,7 +115,7 @@ class RecordedEpisode:
         self.events = events
         self.images = images
         self.depths = depths or {}
-        self.whole = whole
+        self.finished = finished
         self.start = events[0]
         if self.start.get("format") != episode_log.FORMAT:
             raise DataError(
@@ -127,8 +127,14 @@ class RecordedEpisode:
     @property
     def pictures(self) -> Mapping[str, RecordedImages]:
         """Deprecated name of ``images``."""
-        _renamed("RecordedEpisode")
+        _renamed("RecordedEpisode", "pictures", "images")
         return self.images
+
+    @property
+    def whole(self) -> bool:
+        """Deprecated name of ``finished``."""
+        _renamed("RecordedEpisode", "whole", "finished")
+        return self.finished
 
     @property
     def instruction(self) -> str:
@@ -243,7 +249,7 @@ def bag_of(folder: Path) -> Path | None:
 
 
 def read_lines(path: Path) -> tuple[list[Event], bool]:
-    """The events of a ``trace.jsonl``, and whether it is whole; half a last line is left out.
+    """The events of a ``trace.jsonl``, and whether it is finished; half a last line is left out.
 
     Raises:
         DataError: another line is no event.
@@ -272,17 +278,23 @@ class BagContent:
     @property
     def pictures(self) -> list[tuple[str, str, int, Place]]:
         """Deprecated name of ``images``."""
-        _renamed("BagContent")
+        _renamed("BagContent", "pictures", "images")
         return self.images
 
     @property
-    def whole(self) -> bool:
+    def finished(self) -> bool:
         """Whether it was finished."""
-        return self.file.whole
+        return self.file.finished
+
+    @property
+    def whole(self) -> bool:
+        """Deprecated name of ``finished``."""
+        _renamed("BagContent", "whole", "finished")
+        return self.finished
 
 
 def read_bag(path: Path) -> BagContent:
-    """Go through an MCAP file, whole or cut short.
+    """Go through an MCAP file, finished or cut short.
 
     Raises:
         DataError: it is no MCAP file, or damaged before its end.
@@ -309,8 +321,8 @@ def read_bag(path: Path) -> BagContent:
     return replace(found, offset=offset)
 
 
-def _renamed(owner: str) -> None:
-    message = f"{owner}.pictures is deprecated, use images"
+def _renamed(owner: str, old: str, new: str) -> None:
+    message = f"{owner}.{old} is deprecated, use {new}"
     warnings.warn(message, DeprecationWarning, stacklevel=3)
 
 
@@ -319,7 +331,7 @@ def _read(path: Path) -> RecordedEpisode:
     if file is None:
         return RecordedEpisode(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), images={})
     bag = read_bag(file)
-    events, whole = _with_rest(file.parent, bag.events, bag.whole)
+    events, whole = _with_rest(file.parent, bag.events, bag.finished)
     cameras = RecordedEpisode(path, events, whole, {}).embodiment.camera_names
     colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.IMAGE_TYPES}
     images = _sorted(bag, colours, bag.unpacker.image)
@@ -405,7 +417,7 @@ def finish_recording(folder: str | Path) -> bool:
     bag = bag_of(place) if place.is_dir() else None
     if bag is None:
         raise DataError("only an episode's folder with a bag can be finished", where=str(place))
-    if recorded.whole and (place / "metadata.yaml").is_file():
+    if recorded.finished and (place / "metadata.yaml").is_file():
         return False
     aside = place.with_name(f".{place.name}.finishing")
     shutil.rmtree(aside, ignore_errors=True)

@@ -158,7 +158,7 @@ class ReplayOperator(Operator):
         over = self._now() >= self._last - ROUNDING_S
         if over and not self._ended:
             self._ended = True
-            cut = "" if self.recorded.whole else ", where it was cut short"
+            cut = "" if self.recorded.finished else ", where it was cut short"
             self._reporter.info(f"the recording {self.recorded.path} ends here{cut}")
         return over
 
@@ -306,7 +306,7 @@ class ReplayPolicy(Policy):
             RecordingEnded: there is none left; a robot's episode ends well with it.
         """
         if self._next >= len(self._chunks):
-            cut = "" if self.recorded.whole else ", where it was cut short"
+            cut = "" if self.recorded.finished else ", where it was cut short"
             text = f"the recording {self.recorded.path} ends here{cut}"
             self._reporter.info(text)
             raise RecordingEnded(text)

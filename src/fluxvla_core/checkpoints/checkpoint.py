@@ -269,7 +269,7 @@ def folders(place: str | Path) -> list[Path]:
 
 
 def refuse_existing(work_dir: Path) -> None:
-    """Keep a training that resumes from elsewhere, or from nothing, from another's checkpoints.
+    """Raise an error if the work dir has checkpoints that this training does not continue.
 
     Raises:
         UsageError: there are checkpoints in the work dir, with both ways on.
@@ -354,7 +354,7 @@ def rotate(
 
 
 def name_best(work_dir: Path, step: int) -> bool:
-    """Let ``checkpoints/best`` point to the checkpoint of ``step``; whether that is there.
+    """Link ``checkpoints/best`` to the checkpoint of ``step``; returns whether that exists.
 
     Without it there is no ``best``: an old link would name whatever takes its target's name next.
     """

@@ -1,4 +1,4 @@
-"""``PolicyClient``: how the control loop asks a policy, in this process or in another."""
+"""``PolicyClient``: queries a policy for the control loop, in this process or in another."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Answer:
 
 
 class PolicyClient(ABC):
-    """Observes the robot and asks the policy, for one episode.
+    """Observes the robot and queries the policy, for one episode.
 
     ``first_state`` and ``reset`` may take long and are called while nothing moves; the others
     return at once, ``slowest_since`` after a tenth of a second. Calls come from one thread at a

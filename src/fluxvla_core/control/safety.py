@@ -172,7 +172,7 @@ def rule_of(error: BaseException, otherwise: Rule = Rule.RUN) -> str:
 
 @dataclass(frozen=True)
 class Trip:
-    """Why a motion ended: which rule, what it saw, and when (seconds on the loop's clock)."""
+    """The cause of a stop: which rule, what it saw, and when (seconds on the loop's clock)."""
 
     rule: str
     what: str

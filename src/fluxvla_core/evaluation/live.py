@@ -251,7 +251,7 @@ def run_live(
     max_steps: int,
     live: LiveSettings,
 ) -> dict[str, Any]:
-    """One episode on the wall clock.
+    """Run one episode on the wall clock.
 
     Args:
         name: of the folder of its recording.

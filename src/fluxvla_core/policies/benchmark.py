@@ -1,4 +1,4 @@
-"""How long a policy takes to answer: ``fluxvla bench-policy``.
+"""Latency of a policy, stage by stage: ``fluxvla bench-policy``.
 
 One observation after another is asked for a chunk, as a robot does. What is measured follows from
 the command line alone (images, states and weights are drawn from ``seed``), so that anybody can

@@ -1,4 +1,4 @@
-"""How a policy's model computes an answer: ``eager``, ``compiled`` or as a CUDA ``graph``.
+"""Execution of a policy's model: ``eager``, ``compiled`` or as a CUDA ``graph``.
 
 All three give the same actions, up to the rounding of sums in another order. A model that divides
 its answer (``VLA.observe``, ``VLA.denoise``) is timed in two parts, and can be captured: all of its
@@ -283,7 +283,7 @@ class Parts:
         return cls(frozenset(inspect.signature(model.observe).parameters))
 
     def observation(self, batch: Batch) -> dict[str, Any]:
-        """What of ``batch`` belongs to the observation."""
+        """The part of ``batch`` that belongs to the observation."""
         return {name: value for name, value in batch.items() if name in self.names}
 
 

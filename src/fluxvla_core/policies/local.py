@@ -28,8 +28,8 @@ PRECISIONS = ("float32", "bf16")
 
 @dataclass(frozen=True)
 class Query:
-    """One episode's query: what it sees, its seed, how many it asked before, and what the
-    answer has to continue."""
+    """A query of an episode: observation, seed, number of earlier queries, and the rest of the
+    last chunk, which the answer has to continue."""
 
     observation: Observation
     seed: int
@@ -175,7 +175,7 @@ class LocalPolicy(Policy):
         return self._predict(observation, rest)
 
     def host_batch(self, queries: Sequence[Query]) -> dict[str, Any]:
-        """What the model is given for ``queries``, in ``batch_size`` rows, still on the host."""
+        """The model's input for ``queries``, in ``batch_size`` rows, still on the host."""
         import torch
 
         rows = [self._row(query) for query in queries]

@@ -50,7 +50,7 @@ class Phase(str, Enum):
 
 @dataclass(frozen=True)
 class RobotReading:
-    """One reading of the robot: observation, state and their times (s) on the robot's clock.
+    """One observation of the robot, with its frame, state and times (s) on the robot's clock.
 
     Args:
         observation: as the operator gave it, with the instruction.

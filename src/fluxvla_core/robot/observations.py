@@ -37,7 +37,7 @@ _ROUNDING_S = 1e-6  # of sums of a clock's steps
 
 @dataclass(eq=False)
 class ObservationReader:
-    """Reads the robot for the policy, and refuses readings that a policy must not act on.
+    """Reads the robot for the policy; raises an error for what a policy must not act on.
 
     Args:
         robot: the connected robot.
@@ -94,7 +94,7 @@ class ObservationReader:
         return reading
 
     def read(self) -> RobotReading:
-        """One more; in the thread that asks the policy.
+        """The next one; in the thread that queries the policy.
 
         Raises:
             BadFrame: it is not what the embodiment describes, or a stream is gone.

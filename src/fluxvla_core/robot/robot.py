@@ -253,7 +253,7 @@ class Robot:
         return self._bounded("stop", self._operator.stop) if self.can_stop else None
 
     def close(self) -> str | None:
-        """Give the connection back; None, or what went wrong. Never raises, never hangs."""
+        """Close the connection; returns None, or what went wrong. Never raises, never hangs."""
         return self._bounded("close", self._operator.close) if self._has("close") else None
 
     def _has(self, ability: str) -> bool:

@@ -272,7 +272,7 @@ class BaseTrainRunner(Strategy):
         return ""
 
     def check_work_dir(self) -> None:
-        """See that the work dir is still this run's; the first rank has the lock.
+        """Raise an error if the work dir is no longer this run's; the first rank has the lock.
 
         Raises:
             RunFailed: it was removed, moved or replaced.

@@ -1,4 +1,4 @@
-"""What a training costs: memory and operations, counted on the meta device; peak memory.
+"""Memory and FLOPs of a training, counted on the meta device; peak memory.
 
 The model is built on torch's meta device, and runs its forward pass with fake tensors, which have
 shapes and dtypes only: a model of seven billion parameters is counted on a laptop. Weights,

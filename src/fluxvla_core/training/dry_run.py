@@ -171,7 +171,7 @@ def memory_of(
 def activations_of(
     model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]
 ) -> SavedActivations:
-    """What a batch leaves for the backward pass; arguments as of :func:`memory_of`."""
+    """Memory that a batch's forward pass saves for the backward pass; see :func:`memory_of`."""
     arguments = ForwardArguments(model)(batch)
     return fake_activations(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
 

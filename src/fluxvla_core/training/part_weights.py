@@ -25,7 +25,7 @@ _INSIDE = ("model", "state_dict")
 
 
 def load_part_weights(model: nn.Module, parts: Sequence[PartWeights]) -> None:
-    """Give parts of a freshly built ``model`` their published weights.
+    """Load the published weights of ``parts`` into a freshly built ``model``.
 
     Raises:
         CheckpointError: a file is missing or damaged, or its tensors are not those of the part;

@@ -136,7 +136,7 @@ def state_of(what: str, where: str) -> Iterator[None]:
 def forget_missing(
     progress: Progress, world: World, work_dir: Path, resumed: Checkpoint | None
 ) -> None:
-    """Let ``progress`` forget checkpoints that the ``resumed`` one knows and this work dir lacks.
+    """Remove from ``progress`` the checkpoints that this work dir lacks.
 
     The best one may have been removed in favour of a better one that was lost since. Of a
     checkpoint from elsewhere, neither itself nor the best one before it is here.
@@ -153,7 +153,7 @@ def forget_missing(
 
 
 def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
-    """Give this rank the random states it was saved with, or fresh ones of its own.
+    """Restore this rank's random states from the checkpoint, or seed new ones.
 
     With another number of ranks than before there are none to restore: each rank then draws from
     a state that follows from the seed, its rank and the step.

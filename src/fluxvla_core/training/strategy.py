@@ -99,7 +99,7 @@ class Strategy(TrainRunner):
         return vla.to(self.world.device)
 
     def memory_layout(self, model: nn.Module, processes: int, device_type: str) -> Layout:
-        """What one of so many processes keeps of ``model``: for the estimate of a dry run.
+        """Memory layout of ``model`` on one of ``processes``, for the estimate of a dry run.
 
         Here everything, as where ``_wrap_model`` copies the model. A strategy that divides it
         overrides this. Nothing is allocated, no process group is there.

@@ -276,7 +276,7 @@ def resolve_weights(place: str | Path) -> str:
 
 
 def load_initial_weights(model: nn.Module, place: str | Path) -> Path:
-    """Give a freshly built ``model`` the weights of another training, or of an export.
+    """Load the weights of another training, or of an export, into a freshly built ``model``.
 
     Args:
         place: a checkpoint's folder, a work dir (its newest one), a safetensors file, or another
@@ -315,7 +315,7 @@ def _put_all(model: nn.Module, tensors: Mapping[str, Tensor | Stored], path: Pat
 def start_training_with(
     model: nn.Module, init_from: str | None, before: Checkpoint | None, adapter: bool, world: World
 ) -> None:
-    """Give a freshly built ``model`` the weights that ``init_from`` names, if any.
+    """Load the weights that ``init_from`` names, if any, into a freshly built ``model``.
 
     Args:
         before: what the run resumes from: all weights are in it, but for an adapter's base.

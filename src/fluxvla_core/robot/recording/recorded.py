@@ -84,7 +84,7 @@ class RecordedImages:
 
 
 class RecordedEpisode:
-    """One episode. ``open_recording`` makes it.
+    """One recorded episode, as ``open_recording`` reads it.
 
     Args:
         path: the episode's folder, or its MCAP file.

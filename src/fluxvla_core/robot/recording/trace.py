@@ -72,7 +72,7 @@ class Log(Protocol):
         return
 
     def flush(self) -> None:
-        """Give what is there to the system: a process that is killed then loses none of it."""
+        """Flush to the system: a process that is killed then loses none of it."""
 
     def close(self) -> None:
         """Finish the file."""
@@ -104,7 +104,7 @@ def _json(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """What a complete recording holds beyond events and videos.
+    """The parts of a complete recording besides events and videos.
 
     Args:
         names: ``state`` and ``action`` -> joint names.

@@ -124,7 +124,7 @@ class BadCommand(RuleStop):
 
 
 class BadFrame(RuleStop):
-    """A reading is not what the embodiment describes."""
+    """A frame is not what the embodiment describes."""
 
     rule = Rule.FRAME
 

@@ -32,7 +32,7 @@ class InferenceOptions:
     operator that cannot be divided (``Operator.without_cameras``) runs there as a whole, its
     images included."""
     ready_timeout: float = 10.0
-    """seconds that the robot may take to give its first reading."""
+    """seconds that the robot may take to give its first frame."""
 
     policy: Any = None
     """table or object of the Policy contract, instead of a checkpoint."""

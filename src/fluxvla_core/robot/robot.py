@@ -365,7 +365,7 @@ def as_frame(value: Any, source: str) -> Frame:
     if not all(hasattr(value, field) for field in fields):
         raise BadFrame(
             f"{source} gave a {type(value).__name__}, not a Frame",
-            cause="a Frame has state, images and stamps; where there is no reading yet, "
+            cause="a Frame has state, images and stamps; where there is no frame yet, "
             "get_frame() raises NotReady",
             next="see docs/writing-a-plugin.md for an example",
         )

@@ -163,7 +163,7 @@ class RecordedEpisode:
         return self._rows(found, "command", self.embodiment.dim)
 
     def states(self) -> tuple[Array, Array]:
-        """Times ``(N,)``, ascending, and states ``(N, state_dim)`` of every reading.
+        """Times ``(N,)``, ascending, and states ``(N, state_dim)`` of every observation.
 
         A state that came with images is as old as they are: newer ones may have been read before
         it. Its time is when it arrived; one that was read with a command has the command's.

@@ -108,7 +108,7 @@ class ReplayOperator(Operator):
             )
 
     def get_frame(self) -> RobotFrame:
-        """The matched readings of this moment; images in new arrays, depth and base if recorded.
+        """The matched state and images of this moment, in new arrays; depth and base if recorded.
 
         Streams are as late, and as far apart, as they were when the robot was looked at last. No
         stream runs backwards: the recorded looks bound what is shown between them.
@@ -194,7 +194,7 @@ class ReplayOperator(Operator):
         found = sorted(self.recorded.of(episode_log.OBSERVATION), key=lambda event: event["t"])
         if not found:
             raise DataError(
-                "the recording holds no reading of the robot", where=str(self.recorded.path)
+                "the recording holds no observation of the robot", where=str(self.recorded.path)
             )
         return found
 

@@ -63,8 +63,8 @@ COMMAND, FILTER, STOP, END = "command", "filter", "stop", "end"
 ``start``: what runs on what (the first event); ``observation``: what a query or its history showed;
 ``chunk``: a policy's answer that passed its checks; ``refused``: an observation or an answer that
 did not; ``command``: what was sent; ``filter``: an action filter was late, and is left out of the
-command that comes next; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on the
-loop's clock.
+command that comes next; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on
+the loop's clock.
 """
 
 

@@ -38,8 +38,9 @@ FLOOD_BYTES = (100_000, 10_000, 1000, 100, 1)
 DRIVER = logging.getLogger("driver")
 
 
-COMPETITORS = 3
-PATIENCE_S = 10.0
+# Beside ten busy processes Fast DDS freezes within seconds, beside three hardly ever.
+COMPETITORS, COMPETING_S = 10, 20.0
+FROZEN_S, PATIENCE_S = 2.0, 10.0
 FULL_SIZE = replace(ARM, cameras=tuple(replace(c, height=480, width=640) for c in ARM.cameras))
 
 
@@ -241,7 +242,7 @@ def compete_for_the_processors(policy: HarmfulSwing) -> None:
     What is stored from then on is the last moment at which this process ran Python.
     """
     file = os.open(policy.folder / PROVOKED, os.O_CREAT | os.O_WRONLY)
-    until = time.monotonic() + 3 * BLOCKED_S
+    until = time.monotonic() + COMPETING_S
     busy = f"import time\nwhile time.monotonic() < {until}: pass"
     for _ in range(COMPETITORS):
         subprocess.Popen([sys.executable, "-c", busy], env={})

@@ -4,7 +4,7 @@
 
 Nothing is trained, and no weights are there: it is what ``fluxvla run --dry-run`` estimates for the
 configs of this repository, with the strategies and settings below instead of their own. Writes
-``benchmarks/results/memory.json``, which the table of docs/training.md is made of (``--table``
+``benchmarks/results/memory.json``, which the table of docs/models.md is made of (``--table``
 prints it).
 """
 
@@ -178,7 +178,7 @@ def _context(tree: dict[str, Any], column: Strategy) -> RunContext:
 
 
 def table(families: Mapping[str, Any]) -> str:
-    """The table of docs/training.md: GB of each process."""
+    """The table of docs/models.md: GB of each process."""
     titles = [column.title for column in STRATEGIES]
     lines = [
         f"| family | parameters | {' | '.join(titles)} |",

@@ -103,7 +103,7 @@ def test_for_which_steps_the_loop_costs_nothing_to_speak_of() -> None:
 def test_the_memory_of_each_family_is_the_recorded_one() -> None:
     families = results("memory")["families"]
     assert list(families) == list(memory.FAMILIES)
-    said = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
+    said = (ROOT / "docs" / "models.md").read_text(encoding="utf-8")
     assert memory.table(families) in said
     for family in families.values():
         if family["published"] is not None and family["published"] != family["parameters"]:

@@ -37,8 +37,8 @@ def test_a_recipe_is_complete(name: str, capsys: pytest.CaptureFixture[str]) -> 
 
 def tables() -> list[list[list[str]]]:
     """Of the page: recipes by what they train, and by robot; rows of cells."""
-    page = (CONFIGS.parent / "docs" / "training.md").read_text(encoding="utf-8")
-    text = page[page.index("### Recipes") :].partition("\n## ")[0]
+    page = (CONFIGS.parent / "docs" / "models.md").read_text(encoding="utf-8")
+    text = page[page.index("## Training recipes") :].partition("\n## Memory")[0]
     blocks = [block.splitlines()[2:] for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)]
     return [[[c.strip() for c in row.strip("|").split("|")] for row in rows] for rows in blocks]
 

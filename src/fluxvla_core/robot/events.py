@@ -141,7 +141,7 @@ class CommandSent(Event):
 
 
 @dataclass(frozen=True)
-class FilterLeftOut(Event):
+class FilterSkipped(Event):
     """The action filter called ``name`` was late, and is left out of the command that comes next.
 
     After too many in a row there is none: the arm is stopped."""

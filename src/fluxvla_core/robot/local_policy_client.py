@@ -83,7 +83,7 @@ class LocalPolicyClient(PolicyClient):
             ) from error
         self._history.reset()
 
-    def ask(self, previous: PreviousChunk | None) -> Future[Answer]:
+    def query(self, previous: PreviousChunk | None) -> Future[Answer]:
         if self._robot.lockstep:
             observed, seen = self._history.read()
             return self._thread.submit(lambda: self._predict(observed, seen, previous))

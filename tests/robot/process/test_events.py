@@ -18,7 +18,7 @@ from fluxvla_core.robot.events import (
     EpisodePrepared,
     EpisodeStarted,
     Event,
-    FilterLeftOut,
+    FilterSkipped,
     HistoryObserved,
     Observed,
     ObservedFrame,
@@ -56,7 +56,7 @@ TOLD = [
     EpisodeEnded(
         5.0, "failed", None, "no chunk", 3, (Trip("chunk", "x", 4.5), Trip("run", "y", 4.6))
     ),
-    FilterLeftOut(6.0, "Slow"),
+    FilterSkipped(6.0, "Slow"),
 ]
 OWN = [
     EpisodePrepared(0.0, TASK, 7, 50.0),

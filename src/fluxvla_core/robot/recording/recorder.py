@@ -22,7 +22,7 @@ from fluxvla_core.robot.events import (
     EpisodeObserver,
     EpisodePrepared,
     Event,
-    FilterLeftOut,
+    FilterSkipped,
     HistoryObserved,
     Observed,
     ObservedFrame,
@@ -95,7 +95,7 @@ class EpisodeRecorder(EpisodeObserver):
                 self._commands += 1
                 self._keep(logged(event))
                 self._film()
-            case FilterLeftOut() | Stopped():
+            case FilterSkipped() | Stopped():
                 self._keep(logged(event))
             case EpisodeEnded():
                 self._finish(event)

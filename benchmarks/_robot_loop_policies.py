@@ -1,4 +1,4 @@
-"""The policies of ``robot_loop``: one that computes all the time, and one that also holds the GIL."""
+"""Policies of ``robot_loop``: one computes all the time, the other also holds the GIL."""
 
 from __future__ import annotations
 

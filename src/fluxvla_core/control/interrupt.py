@@ -37,7 +37,7 @@ class Interrupted(BaseException):
 
 
 def stop_outcome(failure: str | None) -> str:
-    """Outcome of stopping the robot, for a message; ``failure``: what went wrong with it, or None."""
+    """Outcome of a robot's stop, for a message; ``failure``: what went wrong with it, or None."""
     return "the robot was stopped" if failure is None else f"stopping the robot failed: {failure}"
 
 

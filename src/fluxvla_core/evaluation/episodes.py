@@ -352,7 +352,7 @@ def _parsed(line: str) -> dict[str, Any] | None:
         return None
     if not isinstance(value, dict) or not ("format" in value or _is_episode(value)):
         return None
-    return {_FORMER_KEYS.get(key, key): entry for key, entry in value.items()}
+    return {_FORMER_KEYS.get(str(key), str(key)): entry for key, entry in value.items()}
 
 
 def _is_episode(record: Mapping[str, Any]) -> bool:

@@ -38,12 +38,12 @@ class PolicyAnswer(Answer):
     """A policy's answer to a query, as it came.
 
     Args:
-        observed: the observation of the query.
+        observed_frame: the observation of the query.
         chunk: as it came.
         stages: seconds, by stage; ``policy`` is all of it.
     """
 
-    observed: ObservedFrame
+    observed_frame: ObservedFrame
     chunk: Any
     stages: Mapping[str, float]
 
@@ -101,7 +101,7 @@ class LocalPolicyClient(PolicyClient):
     def accepted(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)
         now = self._robot.clock.now()
-        self._emit(ChunkAccepted(now, answer.observed, answer.checked(), answer.stages))
+        self._emit(ChunkAccepted(now, answer.observed_frame, answer.checked(), answer.stages))
 
     def refused(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)

@@ -92,7 +92,7 @@ class TimedFilter(ActionFilter):
     ) -> None:
         self.name = type(inner).__name__
         self._inner, self._share_s = inner, share_s
-        self._warn, self._left_out = warn, on_skipped
+        self._warn, self._on_skipped = warn, on_skipped
         self._work: queue.SimpleQueue[Callable[[], Array | None]] = queue.SimpleQueue()
         self._results: queue.SimpleQueue[_Result] = queue.SimpleQueue()
         # Whether the thread was given something that it did not give back.
@@ -170,7 +170,7 @@ class TimedFilter(ActionFilter):
             FilterLate: it was so too often.
         """
         self._late += 1
-        self._left_out(self.name)
+        self._on_skipped(self.name)
         took = f"did not return within {self._share_s * 1e3:.3g} ms"
         if self._late >= MOST_LATE:
             raise FilterLate(

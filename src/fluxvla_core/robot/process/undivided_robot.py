@@ -70,7 +70,7 @@ class UndividedRobot(Robot):
         threading.Thread(target=answer, name="fluxvla-frames", daemon=True).start()
 
     def check_frame_time(self) -> None:
-        """Raise an error if ``get_frame`` does not return in time; called at every command in motion.
+        """Raise an error if ``get_frame`` takes too long; called at every command in motion.
 
         Raises:
             BadTiming: it does not: what it will give is old.

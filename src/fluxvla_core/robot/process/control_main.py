@@ -1,7 +1,7 @@
-"""The control process: commands the robot, and asks the main process for chunks.
+"""The control process: commands the robot, and queries the policy through the main process.
 
-It runs the same episodes as a run in one process; where those ask the policy, look at a signal or
-report something, the classes here ask the main process over the link, and never wait for it while
+It runs the same episodes as a run in one process; where those query the policy, look at a signal or
+report something, the classes here send a message to the main process, and never wait for it while
 an arm moves.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control import realtime
-from fluxvla_core.control.interrupt import Interrupted, what_became
+from fluxvla_core.control.interrupt import Interrupted, stop_outcome
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.control.safety import Latch
 from fluxvla_core.control.sender import ExecuteActions
@@ -37,7 +37,7 @@ from fluxvla_core.robot.events import (
     EpisodeEnded,
     EpisodeObserver,
     Event,
-    FilterLeftOut,
+    FilterSkipped,
     Phase,
     Stopped,
 )
@@ -103,7 +103,7 @@ class LinkObserver(EpisodeObserver):
     def __init__(self, link: Link, inbox: Inbox) -> None:
         self._link, self._inbox = link, inbox
         self._commands = 0
-        self._newest: deque[CommandSent | FilterLeftOut | Stopped | EpisodeEnded] = deque(
+        self._newest: deque[CommandSent | FilterSkipped | Stopped | EpisodeEnded] = deque(
             maxlen=_EVENTS_KEPT
         )
         self._folder: Path | None = None
@@ -132,7 +132,7 @@ class LinkObserver(EpisodeObserver):
             self._commands += 1
             if self._commands % _COMMANDS_PER_COLLECTION == 0:
                 gc.collect(1)
-        if isinstance(event, (CommandSent, FilterLeftOut, Stopped, EpisodeEnded)):
+        if isinstance(event, (CommandSent, FilterSkipped, Stopped, EpisodeEnded)):
             self._newest.append(event)
         message = event_message(event)
         if message is not None:
@@ -176,7 +176,7 @@ def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = 
     if isinstance(robot, UndividedRobot):
         assert frame_channel is not None, "the main process shares memory for its images"
         robot.serve(frame_channel, setup.cameras or (), setup.settings.safety.max_age_s)
-        inbox.watch = robot.check_reading
+        inbox.watch = robot.check_frame_time
     observer = LinkObserver(link, inbox)
     parts = _parts(link, setup, robot, execute_actions, inbox, reporter, observer)
     history = RunHistory(commanded=None if setup.before is None else np.asarray(setup.before))
@@ -240,7 +240,7 @@ def _report_orphaned(
     trouble = "; ".join(dict.fromkeys(text for text in (engine.stop_failure, *failures) if text))
     with suppress(OSError):  # The terminal may be gone, too.
         print(
-            f"fluxvla: the main process was killed{before}; {what_became(trouble or None)}",
+            f"fluxvla: the main process was killed{before}; {stop_outcome(trouble or None)}",
             file=sys.stderr,
         )
         if lost is not None:
@@ -319,14 +319,14 @@ def _parts(
     ) -> RemotePolicyClient:
         return RemotePolicyClient(link, inbox, robot, patience_s)
 
-    def left_out(name: str) -> None:
-        observer.on_event(FilterLeftOut(robot.clock.now(), name))
+    def on_skipped(name: str) -> None:
+        observer.on_event(FilterSkipped(robot.clock.now(), name))
 
     made = setup.make_filters(reporter)
     return EpisodeParts(
         robot=robot,
         make_client=make_client,
-        filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, left_out),
+        filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, on_skipped),
         joiner=make_joiner(*setup.joining),
         execute_actions=execute_actions,
         latch=Latch(robot.clock.now),

@@ -27,12 +27,12 @@ from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
 from fluxvla_core.training.cost import (
-    NOTHING,
+    NO_ACTIVATIONS,
     Footprint,
-    Kept,
+    SavedActivations,
     fake,
+    fake_activations,
     footprint,
-    kept_by_fake,
     optimizer_bytes,
 )
 from fluxvla_core.training.lora import LoraOptions
@@ -45,7 +45,7 @@ PROCESSES = (1, 2, 4, 8)
 
 
 @dataclass
-class Rehearsal:
+class DryRun:
     """Results of a dry run.
 
     Args:
@@ -79,45 +79,45 @@ class Rehearsal:
     refused: FluxError | None = None
 
 
-def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
+def dry_run(context: RunContext, processes: Sequence[int] = PROCESSES) -> DryRun:
     """Build the training of ``context.section`` as far as possible.
 
     Args:
         context: with the config's tree.
         processes: for which numbers of them to count the memory.
     """
-    rehearsal = Rehearsal()
-    notes = rehearsal.notes
-    rehearsal.robot = _tried(notes, "the robot is not known", lambda: robot_of(context.config))
+    result = DryRun()
+    notes = result.notes
+    result.robot = _tried(notes, "the robot is not known", lambda: robot_of(context.config))
     what = "the model cannot be built on the meta device"
     model = _tried(notes, what, lambda: on_meta(context))
     runner = _runner(context, notes)
     if model is not None:
-        rehearsal.model = type(model).__name__
-        rehearsal.parameters = sum(p.numel() for p in model.parameters())
-        rehearsal.action_shape = VLA.adapt(model).action_shape
+        result.model = type(model).__name__
+        result.parameters = sum(p.numel() for p in model.parameters())
+        result.action_shape = VLA.adapt(model).action_shape
         if runner is not None and runner.lora is not None:
             attach = partial(_with_adapters, model, runner.lora, context)
             model = _tried(notes, "adapters cannot be put into the model", attach)
     if model is not None:
-        rehearsal.trained = sum(p.numel() for p in trainable(model).values())
-    batch = _batch(context, rehearsal, runner)
-    rehearsal.skeleton, rehearsal.inputs = model, batch
-    _compare(rehearsal)
+        result.trained = sum(p.numel() for p in trainable(model).values())
+    batch = _batch(context, result, runner)
+    result.skeleton, result.inputs = model, batch
+    _compare(result)
     if model is not None and batch is not None:
         try:
-            if rehearsal.data is not None and rehearsal.data.dataset is not None:
-                check_observations(model, rehearsal.data.dataset, context)
+            if result.data is not None and result.data.dataset is not None:
+                check_observations(model, result.data.dataset, context)
             ForwardArguments(model, context.where(f"{context.section}.collator"))(batch)
         except ConfigError as error:
-            rehearsal.refused, batch = error, None
+            result.refused, batch = error, None
     if model is None or runner is None or not processes:
-        return rehearsal
-    if not rehearsal.trained:
-        rehearsal.notes.append("the model has no trainable parameter: all of its parts are frozen")
-        return rehearsal
-    _count(rehearsal, model, runner, batch, processes)
-    return rehearsal
+        return result
+    if not result.trained:
+        result.notes.append("the model has no trainable parameter: all of its parts are frozen")
+        return result
+    _count(result, model, runner, batch, processes)
+    return result
 
 
 def on_meta(context: RunContext) -> nn.Module:
@@ -149,13 +149,15 @@ def memory_of(
         Exception: what a model raises that decides by the values of its inputs.
     """
     options = runner.options
-    by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], Kept] = {}
+    by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], SavedActivations] = {}
     footprints = {}
     for count in processes:
         layout = runner.memory_layout(model, count, device_type)
         lowered = tuple(layout.gathered_as.items())
         if lowered not in by_dtypes:
-            by_dtypes[lowered] = NOTHING if batch is None else kept_of(model, layout, runner, batch)
+            by_dtypes[lowered] = (
+                NO_ACTIVATIONS if batch is None else activations_of(model, layout, runner, batch)
+            )
         footprints[count] = footprint(
             layout,
             by_dtypes[lowered],
@@ -166,14 +168,16 @@ def memory_of(
     return footprints
 
 
-def kept_of(model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]) -> Kept:
-    """What a batch leaves for the backward pass; arguments as of :func:`memory_of`."""
+def activations_of(
+    model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]
+) -> SavedActivations:
+    """Memory that a batch's forward pass saves for the backward pass; see :func:`memory_of`."""
     arguments = ForwardArguments(model)(batch)
-    return kept_by_fake(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
+    return fake_activations(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
 
 
 def _count(
-    found: Rehearsal,
+    found: DryRun,
     model: nn.Module,
     runner: Strategy,
     batch: Mapping[str, Any] | None,
@@ -233,26 +237,26 @@ def _runner(context: RunContext, notes: list[str]) -> BaseTrainRunner | None:
 
 
 def _batch(
-    context: RunContext, rehearsal: Rehearsal, runner: BaseTrainRunner | None
+    context: RunContext, result: DryRun, runner: BaseTrainRunner | None
 ) -> Mapping[str, Any] | None:
     try:
         table = context.config["train_dataloader"]["dataset"]
-        widths = _widths(context.config.get("model", {}), rehearsal.action_shape)
-        rehearsal.data = example(table, context, rehearsal.robot, widths)
-        rehearsal.notes += rehearsal.data.assumed
+        widths = _widths(context.config.get("model", {}), result.action_shape)
+        result.data = example(table, context, result.robot, widths)
+        result.notes += result.data.assumed
         if runner is None:
             return None
         size = runner.loader_options.per_device_batch_size
-        batch: Mapping[str, Any] = runner.collator([rehearsal.data.sample] * size)
+        batch: Mapping[str, Any] = runner.collator([result.data.sample] * size)
     except Refused as refused:
         error = refused.error
         error.where = error.where or context.where("train_dataloader.dataset")
-        rehearsal.refused = error
+        result.refused = error
         return None
     except Exception as error:  # noqa: BLE001 - datasets and transforms of others
-        rehearsal.notes.append(f"the batch is not known: {_one_line(error)}")
+        result.notes.append(f"the batch is not known: {_one_line(error)}")
         return None
-    rehearsal.batch = {
+    result.batch = {
         key: (tuple(value.shape), str(value.dtype).removeprefix("torch."))
         for key, value in batch.items()
         if isinstance(value, Tensor)
@@ -277,25 +281,25 @@ def _named(table: Any, key: str) -> int | None:
     return next((value for value in inner if value is not None), None)
 
 
-def _compare(rehearsal: Rehearsal) -> None:
+def _compare(result: DryRun) -> None:
     """Note where data, model and robot do not fit together."""
-    data, robot, chunk = rehearsal.data, rehearsal.robot, rehearsal.action_shape
+    data, robot, chunk = result.data, result.robot, result.action_shape
     if data is not None and data.dataset is not None and robot is not None:
         for what, have, takes in (
             ("states", data.states, robot.state_dim),
             ("actions", data.actions, robot.dim),
         ):
             if have != takes:
-                rehearsal.notes.append(
+                result.notes.append(
                     f"the dataset's {what} have {have} numbers, those of {robot.name} {takes}"
                 )
     if robot is not None and data is not None:
         missing = sorted(set(data.cameras) - {camera.name for camera in robot.cameras})
         if missing:
-            rehearsal.notes.append(f"{robot.name} has no camera {', '.join(missing)}")
-    actions = rehearsal.batch.get("actions")
+            result.notes.append(f"{robot.name} has no camera {', '.join(missing)}")
+    actions = result.batch.get("actions")
     if chunk is not None and actions is not None and actions[0][1:] != tuple(chunk):
-        rehearsal.notes.append(
+        result.notes.append(
             f"the batch's actions are {actions[0][1:]} a sample, the model's chunks {tuple(chunk)}"
         )
 

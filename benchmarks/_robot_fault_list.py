@@ -72,7 +72,8 @@ def another_robot(stage: Stage) -> None:
 
 def impatient(stage: Stage, operator: BenchArm) -> None:
     stage.operator = operator
-    operator.connect_timeout_s = 2.0
+    # Fast DDS announces a participant again after 3 s.
+    operator.connect_timeout_s = 5.0
 
 
 def silent_camera(stage: Stage) -> None:

@@ -21,8 +21,8 @@ from torch import nn
 from benchmarks import _results
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.config.load import load_config
-from fluxvla_core.training.cost import NOTHING, Kept, footprint, optimizer_bytes
-from fluxvla_core.training.rehearsal import kept_of, rehearse
+from fluxvla_core.training.cost import NO_ACTIVATIONS, SavedActivations, footprint, optimizer_bytes
+from fluxvla_core.training.dry_run import activations_of, dry_run
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 BATCH = 8
@@ -128,10 +128,10 @@ def of_family(family: Family, activations: bool = True) -> dict[str, Any]:
 def _of_config(
     tree: dict[str, Any], columns: Sequence[Strategy], activations: bool
 ) -> tuple[dict[str, Any], int, int]:
-    rehearsed = rehearse(_context(tree, columns[0]), processes=())
-    model, batch = rehearsed.skeleton, rehearsed.inputs
-    assert model is not None, rehearsed.notes
-    kept: dict[Any, Kept | None] = {}
+    built = dry_run(_context(tree, columns[0]), processes=())
+    model, batch = built.skeleton, built.inputs
+    assert model is not None, built.notes
+    kept: dict[Any, SavedActivations | None] = {}
     found = {}
     for column in columns:
         context = _context(tree, column)
@@ -139,17 +139,17 @@ def _of_config(
         layout = runner.memory_layout(model, column.processes, "cuda")
         key = (runner.compute_dtype, tuple(layout.gathered_as.items()))
         if key not in kept:
-            kept[key] = NOTHING if not activations else _kept(model, layout, runner, batch)
+            kept[key] = NO_ACTIVATIONS if not activations else _kept(model, layout, runner, batch)
         state = optimizer_bytes(runner.optimizer_settings.build, layout.optimized)
-        passing = kept[key] or NOTHING
+        passing = kept[key] or NO_ACTIVATIONS
         told = footprint(layout, passing, state, averaged=False, recompute=True).to_dict()
         if kept[key] is None:
             told["activations"] = told["total"] = None
         found[column.title] = told
-    return found, rehearsed.trained, rehearsed.parameters
+    return found, built.trained, built.parameters
 
 
-def _kept(model: nn.Module, layout: Any, runner: Any, batch: Any) -> Kept | None:
+def _kept(model: nn.Module, layout: Any, runner: Any, batch: Any) -> SavedActivations | None:
     """None of a model that decides by the values of its inputs."""
     from torch._subclasses.fake_tensor import (
         DataDependentOutputException,
@@ -157,7 +157,7 @@ def _kept(model: nn.Module, layout: Any, runner: Any, batch: Any) -> Kept | None
     )
 
     try:
-        return kept_of(model, layout, runner, batch)
+        return activations_of(model, layout, runner, batch)
     except (DataDependentOutputException, DynamicOutputShapeException):
         return None
 

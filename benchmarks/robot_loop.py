@@ -34,7 +34,6 @@ jitter p99 at least 5 times, and its memory at least 10 times ours. Loopback onl
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
 import os
 import statistics
@@ -51,13 +50,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from fluxvla_aloha.embodiment import aloha_spec, start_pose
 from fluxvla_aloha.operator import AlohaOperator
 from fluxvla_aloha.presets import COBOT_MAGIC
 from fluxvla_aloha.runner import AlohaInferenceRunner
 
 from benchmarks import _results
+from benchmarks._robot_loop_policies import (
+    RATE_HZ,
+    START_POSE,
+    LockHolder,
+    TenMillion,
+    warm_policy,
+)
 from benchmarks._timed_arms import TIMES, TimedAloha, memory_mb
 from fluxvla_core.build import RunContext
 from fluxvla_core.control import realtime
@@ -67,8 +71,7 @@ from fluxvla_core.ros2.startup import large_frames_profile
 from fluxvla_core.testing.ros2 import claimed_domain
 from fluxvla_core.testing.ros2_driver import Driver
 
-RATE_HZ, HORIZON, EXECUTED = 50.0, 200, 25
-START_POSE = start_pose("viperx300")
+EXECUTED = 25
 LATE_S = 0.002
 GOALS = {
     "late_share": 0.001,
@@ -80,68 +83,8 @@ GOALS = {
     "memory": 10.0,
 }
 OURS = ("fluxvla", "recording", "lock held")
-LOCKED_S = 0.1
 QUEUE = 2000
 PICTURES = 3 * 480 * 640 * 3
-
-
-class TenMillion:
-    """A transformer over patches of all images; swings both arms gently, whatever it sees."""
-
-    action_rate_hz, horizon = RATE_HZ, HORIZON
-    embodiment = aloha_spec()
-
-    def __init__(self) -> None:
-        torch.set_num_threads(1)
-        torch.manual_seed(0)
-        layer = torch.nn.TransformerEncoderLayer(384, 6, 1536, 0.0, batch_first=True)
-        self.encoder = torch.nn.TransformerEncoder(layer, 6, enable_nested_tensor=False).eval()
-        self.patches = torch.nn.Linear(3 * 20 * 20, 384)
-        self.seconds: list[float] = []
-
-    @property
-    def parameters(self) -> int:
-        parts = (self.encoder, self.patches)
-        return sum(p.numel() for part in parts for p in part.parameters())
-
-    def reset(self, seed: int) -> None:
-        self.seconds.clear()
-
-    def predict_action(self, observation: dict[str, Any]) -> np.ndarray[Any, Any]:
-        began = time.perf_counter()
-        small = np.stack([image[::4, ::4] for image in observation["images"].values()])
-        tokens = small.reshape(-1, 6, 20, 8, 20, 3).swapaxes(2, 3).reshape(1, -1, 1200)
-        with torch.inference_mode():
-            found = self.encoder(self.patches(torch.from_numpy(tokens).float() / 255)).mean()
-        ahead = time.monotonic() + np.arange(1, HORIZON + 1) / RATE_HZ
-        chunk = np.tile(np.array(START_POSE), (HORIZON, 1))
-        chunk[:, [0, 7]] += 0.2 * np.sin(ahead)[:, None] + 1e-9 * float(found)
-        self.seconds.append(time.perf_counter() - began)
-        return chunk
-
-
-class LockHolder(TenMillion):
-    """Keeps the interpreter's lock half of the time, for ``LOCKED_S`` in one call."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        # PyDLL does not give the lock up around a call; and it takes as long on a busy machine.
-        self._keep = ctypes.PyDLL(None).usleep
-
-    def predict_action(self, observation: dict[str, Any]) -> np.ndarray[Any, Any]:
-        self._keep(round(LOCKED_S * 1e6))
-        began = time.perf_counter()
-        chunk = super().predict_action(observation)
-        time.sleep(max(LOCKED_S - (time.perf_counter() - began), 0.0))
-        return chunk
-
-
-def warm_policy(kind: type[TenMillion] = TenMillion) -> TenMillion:
-    """One whose libraries have what they want."""
-    policy = kind()
-    for _ in range(3):
-        policy.predict_action({"images": {n: np.zeros((480, 640, 3), np.uint8) for n in range(3)}})
-    return policy
 
 
 class Memory:

@@ -27,6 +27,7 @@ from benchmarks._robot_fault_list import FAULTS
 from benchmarks._robot_faults import Fault, Result, Stage, stage_crew
 from benchmarks._whole_faults import WHOLE_FAULTS
 
+NO_HOLD = "no hold: the last command stays"
 ALL = (*FAULTS, *PROCESS_FAULTS, *WHOLE_FAULTS)
 
 
@@ -62,6 +63,19 @@ def measured(fault: Fault, results: list[Result]) -> dict[str, Any]:
     return found
 
 
+def shown(found: dict[str, Any]) -> str:
+    """The column 'time to hold' of docs/safety.md, of one fault's figures.
+
+    Without a command after the fault the time is 0: nothing holds the arm.
+    """
+    without = {"refused": "nothing moves", "goes on": "goes on"}.get(found["outcome"])
+    return without or _time(found["median_s"])
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.2f} s" if round(seconds, 2) else NO_HOLD
+
+
 def main() -> int:
     """Measure, print and write; 1 if a fault was not named as it should be."""
     parser = _results.options(__file__)
@@ -77,7 +91,7 @@ def main() -> int:
             for index, fault in enumerate(faults):
                 result = played(stage, Path(folder) / f"{number}-{index}", fault)
                 results[fault.name].append(result)
-                hold = "" if result.hold_s is None else f"{result.hold_s:.2f} s"
+                hold = "" if result.hold_s is None else _time(result.hold_s)
                 agrees = fault.matches(result.said) and result.exit_code == fault.exit_code
                 mark = "" if agrees else "  NOT AS EXPECTED"
                 wrong += [fault.name] if mark else []

@@ -136,12 +136,12 @@ def measured(name: str, seconds: float) -> dict[str, Any]:
         rows = [row for row in recording.of("command") if row["phase"] == "run"]
         (end,) = recording.of("end")
         found = json.loads(times.read_text(encoding="utf-8"))
-    ticks = len(rows) + end["skipped_beats"]
+    ticks = len(rows) + end["skipped_ticks"]
     late = np.array([row["ms"]["late"] for row in rows]) > LATE_S * 1e3
     return {
-        "beats": ticks,
-        "skipped": end["skipped_beats"],
-        "skipped_share": round(end["skipped_beats"] / ticks, 5),
+        "ticks": ticks,
+        "skipped": end["skipped_ticks"],
+        "skipped_share": round(end["skipped_ticks"] / ticks, 5),
         "late_share": round(float(late.mean()), 5),
         **({"control_core_share": found["core_share"]} if control_process else {}),
     }

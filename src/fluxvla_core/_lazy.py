@@ -19,7 +19,7 @@ def attach(
 
     Its names are those that it imports under ``if TYPE_CHECKING``, each as
     ``from package.module import Name as Name``. Type checkers and editors follow these imports;
-    here they are read from the source.
+    here they are read from the source, or from the bytecode where that alone is installed.
 
     Args:
         module: ``__name__`` of the public module.
@@ -27,9 +27,13 @@ def attach(
             is not in ``__all__``.
     """
     public: Any = sys.modules[module]
-    # By the loader: the package may be in an archive.
-    text = public.__loader__.get_data(public.__file__).decode()
-    sources = {name: source for source, name in _IMPORT.findall(text)}
+    if public.__file__.endswith(".pyc"):  # ``compileall -b``, and the sources removed
+        sources = _imports_of(public.__loader__.get_code(module))
+        sources = {name: source for name, source in sources.items() if name not in vars(public)}
+    else:
+        # By the loader: the package may be in an archive.
+        text = public.__loader__.get_data(public.__file__).decode()
+        sources = {name: source for source, name in _IMPORT.findall(text)}
     renamed = dict(deprecated or {})
 
     def __getattr__(name: str) -> Any:
@@ -52,3 +56,16 @@ def attach(
         return sorted({*vars(public), *sources})
 
     return __getattr__, __dir__, sorted(sources)
+
+
+def _imports_of(code: Any) -> dict[str, str]:
+    """Name -> module, of every ``from module import name`` of a module's bytecode."""
+    import dis
+
+    sources, package = {}, ""
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "IMPORT_NAME":
+            package = instruction.argval
+        elif instruction.opname == "IMPORT_FROM":
+            sources[instruction.argval] = package
+    return sources

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fluxvla_core.config.resolve import INJECTED
-from fluxvla_core.config.runtime_signature import misfits, option_names
+from fluxvla_core.config.runtime_signature import option_names, type_mismatches
 from fluxvla_core.config.signature import OPTIONS_KEYWORDS
 from fluxvla_core.config.tree import join_key
 from fluxvla_core.contracts.robot import Operator
@@ -170,7 +170,7 @@ def parameters(cls: type) -> set[str]:
 
 def _explained(cls: type, cfg: Mapping[str, Any], context: RunContext | None) -> ConfigError | None:
     """The error for values that do not fit the annotations of a constructor, if there are any."""
-    wrong = misfits(cls, {key: value for key, value in cfg.items() if key != "type"})
+    wrong = type_mismatches(cls, {key: value for key, value in cfg.items() if key != "type"})
     if not wrong:
         return None
     table = _key_of(cfg, context.config) if context is not None else None

@@ -118,7 +118,7 @@ def _rebuild(
 
 @contextmanager
 def located(where: str | None) -> Iterator[None]:
-    """Give errors of the block that name no place the place ``where``, if it is known."""
+    """Context manager: set ``where`` of errors raised inside that name no place."""
     try:
         yield
     except FluxError as error:

@@ -228,8 +228,8 @@ class _Marked:
     """The hook methods of an object, marked as implementations for pluggy."""
 
     def __init__(self, plugin: object) -> None:
-        brought = [name for name in NAMES if implements(plugin, Hook, name)]
-        self.names = [name for name in brought if callable(getattr(plugin, name))]
+        defined = [name for name in NAMES if implements(plugin, Hook, name)]
+        self.names = [name for name in defined if callable(getattr(plugin, name))]
         for name in self.names:
             method = getattr(plugin, name)
             # A method cannot carry pluggy's mark; a function around it would hide its arguments.

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.checkpoints import checkpoint
-from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest, newest_whole
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, latest, newest_undamaged
 from fluxvla_core.checkpoints.manifest import FileEntry, Manifest, read_manifest
 from fluxvla_core.checkpoints.writer import CheckpointWriter
 from fluxvla_core.errors import CheckpointError
@@ -117,7 +117,7 @@ def test_a_file_that_cannot_be_read_is_named_and_passed_over(tmp_path, monkeypat
         return read(path)
 
     monkeypatch.setattr(checkpoint, "hash_file", failing)
-    found, (refused,) = newest_whole(tmp_path)
+    found, (refused,) = newest_undamaged(tmp_path)
     assert found.path == first
     assert refused.what == "model.safetensors cannot be read: Input/output error"
     with pytest.raises(CheckpointError) as caught:
@@ -142,7 +142,7 @@ def test_a_folder_that_cannot_be_looked_into_is_passed_over(tmp_path, monkeypatc
 
     monkeypatch.setattr(Path, "is_file", denied(Path.is_file))
     monkeypatch.setattr(os, "open", denied(os.open))
-    found, (refused,) = newest_whole(tmp_path)
+    found, (refused,) = newest_undamaged(tmp_path)
     assert found.path == first
     assert "manifest.json cannot be read" in refused.what
 
@@ -203,13 +203,13 @@ def test_newest_whole_says_what_it_passed_over(tmp_path):
     write(tmp_path, 1)
     (write(tmp_path, 2) / "policy.json").unlink()
     (write(tmp_path, 3) / "manifest.json").write_text("{}")
-    found, refused = newest_whole(tmp_path)
+    found, refused = newest_undamaged(tmp_path)
     assert found.step == 1
     assert [error.what.split(":")[0] for error in refused] == [
         "manifest.json is damaged",
         "policy.json is missing from the checkpoint",
     ]
-    assert newest_whole(tmp_path / "nowhere") == (None, [])
+    assert newest_undamaged(tmp_path / "nowhere") == (None, [])
 
 
 def relisted(path, name):

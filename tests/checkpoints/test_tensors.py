@@ -59,7 +59,7 @@ def test_every_dtype_comes_back_bit_for_bit(tmp_path):
 
 
 def test_tied_weights_are_stored_once_and_come_back_under_both_names(tmp_path):
-    """T9 of the field notes: tied weights made saving fail."""
+    """T9 of upstream's bugs: tied weights made saving fail."""
     net = nn.ModuleDict({"a": nn.Linear(50, 50, bias=False), "b": nn.Linear(50, 50, bias=False)})
     net["b"].weight = net["a"].weight
     path = saved(tmp_path, net.state_dict(keep_vars=True))
@@ -72,7 +72,7 @@ def test_tied_weights_are_stored_once_and_come_back_under_both_names(tmp_path):
 
 
 def test_reading_takes_no_memory_before_it_is_used(tmp_path):
-    """T11 of the field notes: every rank held the whole checkpoint in memory."""
+    """T11 of upstream's bugs: every rank held the whole checkpoint in memory."""
     path = saved(tmp_path, {str(i): torch.ones(1 << 20) for i in range(20)})
     before = anonymous_kib()
     found = read_tensors(path)

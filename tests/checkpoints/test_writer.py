@@ -187,7 +187,7 @@ def test_floats_in_json_keep_every_bit(tmp_path):
 
 
 def test_rotation_goes_by_step_whatever_the_file_times_say(tmp_path):
-    """T10 of the field notes: rotation went by modification time."""
+    """T10 of upstream's bugs: rotation went by modification time."""
     for step in (9, 10, 100, 1000):
         path = write(tmp_path, step)
         os.utime(path, (2_000_000_000 - step, 2_000_000_000 - step))
@@ -196,7 +196,7 @@ def test_rotation_goes_by_step_whatever_the_file_times_say(tmp_path):
 
 
 def test_keeping_none_means_keeping_all(tmp_path):
-    """T10 of the field notes: ``[:-0]`` deletes nothing or everything by accident."""
+    """T10 of upstream's bugs: ``[:-0]`` deletes nothing or everything by accident."""
     for step in (1, 2, 3):
         write(tmp_path, step)
     assert rotate(tmp_path, 0) == []

@@ -215,9 +215,9 @@ def test_nothing_to_run(run: Fluxvla, write: Write) -> None:
     assert "d.py: nothing to run: no table at the top has a type that is a runner" in ended.err
     ended = run("--config", "d.py", "--section", "runner")
     assert "no section 'runner'\n  next: sections there: none" in ended.err
-    write("e.py", "rehearse = dict(type='ToyEvalRuner')\n")
+    write("e.py", "spare = dict(type='ToyEvalRuner')\n")
     ended = run("--config", "e.py")
-    assert "rehearse.type: no plugin named 'ToyEvalRuner' in any registry" in ended.err
+    assert "spare.type: no plugin named 'ToyEvalRuner' in any registry" in ended.err
 
 
 @pytest.mark.parametrize(

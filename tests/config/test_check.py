@@ -248,8 +248,8 @@ layers = [dict(type='ToyResize')]
 
 
 def test_a_section_of_another_name_is_a_section(write: Write) -> None:
-    text = GOOD + "rehearsal = dict(type='ToyInferenceRunner')\n"
-    assert "rehearsal: ToyInferenceRunner needs 'operator', 'task_descriptions'" in findings(
+    text = GOOD + "spare = dict(type='ToyInferenceRunner')\n"
+    assert "spare: ToyInferenceRunner needs 'operator', 'task_descriptions'" in findings(
         text, write
     )
 

@@ -77,6 +77,11 @@ def test_set_takes_what_the_class_of_the_table_takes(write: Write, key: str) -> 
             "did you mean --set runner.learning_rate=1?",
         ),
         (
+            "runner.warmup_steps=500",
+            "no 'runner.warmup_steps' in the config, and ToyTrainRunner takes no 'warmup_steps'; "
+            "did you mean --set runner.warmup_ratio=… (the share of the run's steps, from 0 to 1)?",
+        ),
+        (
             "inference.operator.zzz=[1, 2]",
             "no 'inference.operator.zzz' in the config, and ToyOperator takes no 'zzz'",
         ),

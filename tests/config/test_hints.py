@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fluxvla_core.config.overrides import complete, whole_options
+from fluxvla_core.config.overrides import complete, complete_hints
 from fluxvla_core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,12 +39,24 @@ def test_a_hint_gets_the_keys_of_the_tables(hint, whole):
 
 
 def test_an_error_that_passes_is_completed():
-    with pytest.raises(ConfigError) as caught, whole_options(CONFIG):
+    with pytest.raises(ConfigError) as caught, complete_hints(CONFIG):
         raise ConfigError("too narrow", next="--set <Pad>.width=3")
     assert caught.value.next == "--set train.transforms.1.width=3"
-    with pytest.raises(ConfigError) as caught, whole_options(CONFIG):
+    with pytest.raises(ConfigError) as caught, complete_hints(CONFIG):
         raise ConfigError("too narrow", next="--set <section>.width=3")
     assert caught.value.next == "--set <section>.width=3", "no section runs"
+
+
+SECTION = re.compile(
+    r'"[^"\n]*--set \'?(?:runner|eval|inference)\.|^\s*"(?:runner|eval|inference)\.\w+=', re.M
+)
+
+
+def test_no_hint_assumes_the_name_of_a_section():
+    """A config may call its sections anything: ``<section>`` becomes the one that runs."""
+    sources = [*ROOT.glob("src/**/*.py"), *ROOT.glob("plugins/*/src/**/*.py")]
+    found = {path.name for path in sources if SECTION.search(path.read_text(encoding="utf-8"))}
+    assert found == set()
 
 
 def test_no_hint_names_a_bare_key():

@@ -6,7 +6,7 @@ from typing import Any, Optional
 
 import pytest
 
-from fluxvla_core.config.runtime_signature import misfits
+from fluxvla_core.config.runtime_signature import type_mismatches
 
 
 class Base:
@@ -43,7 +43,7 @@ class Child(Typed):
     ],
 )
 def test_what_fits(values):
-    assert misfits(Child, values) == []
+    assert type_mismatches(Child, values) == []
 
 
 @pytest.mark.parametrize(
@@ -54,10 +54,10 @@ def test_what_fits(values):
     ],
 )
 def test_what_does_not(name, value):
-    (found,) = misfits(Child, {name: value})
+    (found,) = type_mismatches(Child, {name: value})
     assert str(found).startswith(f"{name!r} must be ")
     assert str(found).endswith(f"got {value!r}")
 
 
 def test_annotations_that_cannot_be_read_count_for_nothing():
-    assert misfits(Base, {"rate": "a", "unknown": 3}) == []
+    assert type_mismatches(Base, {"rate": "a", "unknown": 3}) == []

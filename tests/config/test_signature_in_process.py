@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from fluxvla_core.build import parameters
-from fluxvla_core.config.runtime_signature import inspect_signature, misfits
+from fluxvla_core.config.runtime_signature import inspect_signature, type_mismatches
 from fluxvla_core.config.signature import Signature
 
 
@@ -94,7 +94,7 @@ def test_options_of_a_class_of_this_process() -> None:
     place = signature.parameters[1].place
     assert place.endswith(f"test_signature_in_process.py:{_line('class Settings') - 1}")
     assert parameters(Configured) == {"cfg", "must", "rate", "steps"}
-    assert [str(one) for one in misfits(Configured, {"rate": "fast"})] == [
+    assert [str(one) for one in type_mismatches(Configured, {"rate": "fast"})] == [
         "'rate' must be float, got 'fast'"
     ]
 

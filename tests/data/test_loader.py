@@ -92,7 +92,7 @@ def noise(found):
 
 
 def test_global_generators_draw_by_the_batch_and_not_by_who_makes_it():
-    """D3 of the field notes, for workers: theirs began alike on every rank and after a restart."""
+    """D3 of upstream's bugs, for workers: theirs began alike on every rank and after a restart."""
     whole = batches(9, dataset=Careless())
     assert equal(whole, batches(9, workers=2, dataset=Careless()))
     assert equal(whole[6:], batches(3, start=Cursor(1, 2), workers=2, dataset=Careless()))

@@ -117,7 +117,7 @@ def test_a_step_has_the_same_samples_however_it_is_split(split):
 
 
 def test_every_sample_is_used_in_every_epoch_and_epochs_differ():
-    """D2 of the field notes: every epoch had the same order."""
+    """D2 of upstream's bugs: every epoch had the same order."""
     first, second = steps(plan(5), 4)[:2], steps(plan(5), 4)[2:]
     for epoch in (first, second):
         assert sorted(index for step in epoch for _, index in step) == list(range(10))
@@ -139,7 +139,7 @@ def test_a_dataset_smaller_than_a_step():
 
 @pytest.mark.parametrize("done", range(9))
 def test_going_on_gives_what_would_have_come(done):
-    """T7 of the field notes: resuming began again at index 0."""
+    """T7 of upstream's bugs: resuming began again at index 0."""
     whole = plan(4)
     cursor = Cursor()
     for _ in range(done):

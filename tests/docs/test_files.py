@@ -9,14 +9,17 @@ from pathlib import Path
 import pytest
 
 from fluxvla_core.build import RunContext
+from fluxvla_core.checkpoints.writer import free_name
+from fluxvla_core.evaluation import robot, runner
 from fluxvla_core.evaluation.runner import EvalRunner
-from fluxvla_core.robot.recording.episode_log import EpisodeSummary
+from fluxvla_core.robot.recording import trace
+from fluxvla_core.robot.recording.episode_log import HELD, EpisodeSummary
 from tests.evaluation.conftest import walking
 
 __all__ = ["walking"]
 
 PAGE = Path(__file__).parents[2] / "docs" / "files.md"
-LIVE = {"outcome", "ticks", "late_ticks", "missed_ticks", "skipped_beats", "trips", "record"}
+LIVE = {"outcome", "ticks", "late_ticks", "missed_ticks", "skipped_ticks", "trips", "record"}
 
 
 def documented(title: str) -> set[str]:
@@ -60,10 +63,18 @@ def test_an_evaluations_files_have_the_keys_that_are_documented(evaluated, live)
     written = set(json.loads(episode))
     in_table = documented("`episodes.jsonl`")
     assert written <= in_table
-    optional = {"error", "behaviours", "pictures"}
+    optional = {"error", "behaviours", "images"}
     expected = in_table - optional - (LIVE if not live else {"clamped", "return", "state_hash"})
     assert expected <= written
 
 
+def test_files_that_only_some_runs_write_are_listed(tmp_path):
+    table = PAGE.read_text(encoding="utf-8").partition("## Work dir")[2].partition("\n## ")[0]
+    names = {runner.FOLDER, runner.LIVE_FOLDER, robot.FOLDER, free_name(tmp_path / "x").suffix}
+    names |= {trace.EVENTS_FILE, trace.SUMMARY_FILE, trace.REST_FILE, HELD}
+    assert {name for name in names if name not in table} == set()
+
+
 def test_an_episodes_summary_has_the_keys_that_are_documented():
-    assert set(EpisodeSummary().to_dict()) == documented("`episode.json`")
+    # What was dropped is counted by what writes the file.
+    assert {*EpisodeSummary().to_dict(), "dropped"} == documented("`episode.json`")

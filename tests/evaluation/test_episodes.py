@@ -133,6 +133,15 @@ def test_an_episode_log_of_the_former_format_says_nothing_of_its_code(tmp_path):
     assert EvalLog(path, {"a": 2}, code=CODE).set_aside is not None, "another evaluation still is"
 
 
+def test_records_of_version_0_1_are_read_under_the_present_keys(tmp_path):
+    path = tmp_path / "episodes.jsonl"
+    record = {"group": "policy", "task": "task", "seed": 0, "status": "done", "success": True}
+    former = {"skipped_beats": 2, "pictures": {"sizes": {"top": [8, 9]}, "by": "egl: a"}}
+    EvalLog(path, {"a": 1}, code=CODE).add({**record, **former})
+    (read,) = EvalLog(path, {"a": 1}, code=CODE).records(keys_of(1))
+    assert read == {**record, "skipped_ticks": 2, "images": former["pictures"]}
+
+
 def test_a_crash_is_an_error_and_not_a_failure(tmp_path):
     listener = Listener()
     keys = [*keys_of(2), EpisodeKey("policy", "crash", 4), EpisodeKey("policy", "crashonce", 6)]

@@ -9,7 +9,7 @@ import pytest
 
 from fluxvla_core.errors import CheckpointError, ConfigError, RunFailed, SpecMismatch
 from fluxvla_core.evaluation.policy_server import PolicyServer, ServedPolicy, check_rows
-from fluxvla_core.policies.local import Question
+from fluxvla_core.policies.local import Query
 from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
 pytest.importorskip("torch")
@@ -26,14 +26,14 @@ class Batched:
     def __init__(self, batch_size=3, leaks=False):
         self.batch_size, self.leaks, self.sizes, self.started = batch_size, leaks, [], None
 
-    def predict_batch(self, questions):
-        self.sizes.append(len(questions))
+    def predict_batch(self, queries):
+        self.sizes.append(len(queries))
         if self.started is not None:
             self.started.set()
             self.go.wait(30)
-        for question in questions:
-            match question.observation["task_description"]:
-                case "crowd" if len(questions) > 1:
+        for query in queries:
+            match query.observation["task_description"]:
+                case "crowd" if len(queries) > 1:
                     raise MemoryError("too many at once")
                 case "raise":
                     raise ZeroDivisionError("weights exploded")
@@ -41,10 +41,10 @@ class Batched:
                     raise SpecMismatch("nobody can do that")
                 case "fail":
                     raise RunFailed("out of memory")
-        total = sum(float(q.observation["qpos"][0]) for q in questions) if self.leaks else 0.0
+        total = sum(float(q.observation["qpos"][0]) for q in queries) if self.leaks else 0.0
         return [
             np.array([[q.seed, q.call, q.observation["qpos"][0] + total, q.rest is not None]] * 2)
-            for q in questions
+            for q in queries
         ]
 
 
@@ -128,13 +128,13 @@ def test_a_failing_policy_fails_those_who_asked_and_no_one_else(server):
 def test_one_that_cannot_be_answered_is_no_error_of_its_company(server, policy, words, kind, text):
     connections = [server.link() for _ in range(4)]
     for connection in connections:  # once they are answered the server knows them all
-        connection.send(("policy", Question(see(), 0, 0)))
+        connection.send(("policy", Query(see(), 0, 0)))
         connection.recv()
     policy.sizes.clear()
     server.batches = server.rows = 0
     policy.started, policy.go = threading.Event(), threading.Event()
     for number, asked in enumerate(("go", "go", words, "go")):
-        connections[number].send(("policy", Question(see(0.5, asked), number, 0)))
+        connections[number].send(("policy", Query(see(0.5, asked), number, 0)))
         assert policy.started.wait(30), "the first is asked alone, while the others wait"
     policy.go.set()
     answers = [connection.recv() for connection in connections]
@@ -149,7 +149,7 @@ def test_one_that_cannot_be_answered_is_no_error_of_its_company(server, policy, 
 
 def test_a_worker_that_is_gone_takes_nobody_with_it(server):
     one = client(server)
-    one._connection.send(("policy", Question(see(), 0, 0)))
+    one._connection.send(("policy", Query(see(), 0, 0)))
     one._connection.close()
     assert client(server).predict_action(see()).shape == (2, 4)
 
@@ -178,4 +178,4 @@ def test_rows_that_depend_on_their_company_are_refused():
     check_rows(Batched(1, leaks=True))
     with pytest.raises(ConfigError, match="batch_size = 3: on cpu a row's result depends on") as e:
         PolicyServer({"policy": lambda: Batched(leaks=True)})
-    assert "--set eval.batch_size=1, or another size" in str(e.value)
+    assert "--set <section>.batch_size=1, or another size" in str(e.value)

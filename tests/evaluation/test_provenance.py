@@ -71,8 +71,8 @@ def test_the_commit_is_that_of_the_checkout_with_the_code(tmp_path):
 
 
 def test_several_machines_may_draw_one_evaluation():
-    one = {"pictures": {"sizes": {"top": [8, 9]}, "by": "egl: a"}}
-    two = {"pictures": {"sizes": {"top": [8, 9]}, "by": "osmesa: b"}}
+    one = {"images": {"sizes": {"top": [8, 9]}, "by": "egl: a"}}
+    two = {"images": {"sizes": {"top": [8, 9]}, "by": "osmesa: b"}}
     assert rendering([one, two, one, {}]) == {
         "sizes": {"top": [8, 9]},
         "by": ["egl: a", "osmesa: b"],

@@ -74,13 +74,13 @@ def test_times_of_steps_and_images_and_memory_are_those_of_finished_episodes():
 
 def test_ticks_of_live_episodes_are_summed():
     live = {"status": "done", "steps": 30, "ticks": 28, "missed_ticks": 6, "late_ticks": 1}
-    live |= {"skipped_beats": 2, "trips": ["starvation", "later"]}
+    live |= {"skipped_ticks": 2, "trips": ["starvation", "later"]}
     found = results_file.ticks([live, {**live, "trips": []}, {"status": "error"}])
     assert found == {
         "ticks": 56,
         "missed_ticks": 12,
         "missed_share": 0.2,
-        "skipped_beats": 4,
+        "skipped_ticks": 4,
         "late_ticks": 2,
         "stopped_by": {"starvation": 1},
     }
@@ -163,6 +163,6 @@ def test_an_evaluation_with_errors_is_not_whole(tmp_path):
 
 
 def test_no_checkpoint_is_said_with_what_to_do(tmp_path):
-    with pytest.raises(CheckpointError, match="no whole checkpoint") as caught:
+    with pytest.raises(CheckpointError, match="no undamaged checkpoint") as caught:
         chosen_checkpoint(None, tmp_path)
     assert "train first" in str(caught.value)

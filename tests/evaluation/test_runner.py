@@ -264,7 +264,7 @@ def test_episodes_of_other_code_are_asked_for_and_never_silently_counted(
     options = {"tasks": ["right"], "episodes": 2, "workers": 1}
     evaluate(tmp_path, **options)
     first = results(tmp_path)["provenance"]
-    assert set(first) >= {"date", "commit", "versions", "code", "machine", "seeds", "pictures"}
+    assert set(first) >= {"date", "commit", "versions", "code", "machine", "seeds", "images"}
     assert first["seeds"] == {"policy": [0, 1]}
     assert first["reused"] == {"episodes": 0, "changed": []}
     assert {"fluxvla-core", "numpy"} <= set(first["versions"])
@@ -277,7 +277,7 @@ def test_episodes_of_other_code_are_asked_for_and_never_silently_counted(
     load_plugin_files([path])
     with pytest.raises(UsageError, match=r"run with other code: source code \w+ -> \w+") as caught:
         evaluate(tmp_path, **options, reporter=listener)
-    assert "--set eval.reuse=true to count them" in str(caught.value)
+    assert "--set <section>.reuse=true to count them" in str(caught.value)
     assert (tmp_path / "eval" / "results.json").read_text() == before
 
     evaluate(tmp_path, **{**options, "episodes": 3}, reuse=True, reporter=listener)
@@ -320,7 +320,7 @@ def test_results_say_whether_training_saw_their_seeds(tmp_path, checkpoint, firs
 
 def test_how_images_were_drawn_is_in_the_results(tmp_path, walking):
     evaluate(tmp_path, policy={"type": "Thinker"}, tasks=["right"], episodes=1, workers=1)
-    images = results(tmp_path)["provenance"]["pictures"]
+    images = results(tmp_path)["provenance"]["images"]
     assert images == {"sizes": {"eye": [24, 32]}, "by": []}, "no OpenGL drew these"
 
 

@@ -65,7 +65,7 @@ def test_fresh_streams_pass_and_the_oldest_ones_age_is_told(gate):
 @pytest.mark.parametrize(
     ("state", "front", "message"),
     [
-        (9.4, 9.4, "stream state is stale: its newest reading is 0.60 s old, safety.max_age_s is"),
+        (9.4, 9.4, "stream state is stale: its newest data is 0.60 s old, safety.max_age_s is"),
         (10.0, 9.45, "stream front is stale"),
         (10.0, 9.7, "streams front and state are 0.30 s apart, safety.max_skew_s is 0.2"),
         (10.2, 10.0, "stream state is stamped 0.200 s in the future"),

@@ -48,7 +48,7 @@ class DividedArm(Arm):
         return self
 
 
-class Recorded(Arm):
+class RecordedEpisode(Arm):
     follows_commands = False
 
 
@@ -86,7 +86,7 @@ class Simulated(DividedArm):
 
 @pytest.fixture(autouse=True)
 def registered():
-    classes = [Arm, DividedArm, Simulated, Recorded, OwnClock, Placed, Connecting]
+    classes = [Arm, DividedArm, Simulated, RecordedEpisode, OwnClock, Placed, Connecting]
     for cls in classes:
         OPERATORS.register_module()(cls)
     yield
@@ -164,9 +164,9 @@ def local_arm():
     [
         ({"type": "Arm"}, OwnObservation, "OwnObservation reads the robot by a method of its own"),
         (
-            {"type": "Recorded"},
+            {"type": "RecordedEpisode"},
             BaseInferenceRunner,
-            "Recorded is a recording, which",
+            "RecordedEpisode is a recording, which",
         ),
         ({"type": "OwnClock"}, BaseInferenceRunner, "OwnClock .* has a clock of its own"),
         ({"type": "Connecting"}, BaseInferenceRunner, "Connecting connects in its constructor"),
@@ -218,7 +218,7 @@ def test_what_only_the_control_process_knew_completes_a_record(tmp_path):
 
     recorded = open_recording(tmp_path)
 
-    assert recorded.whole
+    assert recorded.finished
     np.testing.assert_array_equal(recorded.commands()[0], [0.1, 0.2, 0.3])
     assert recorded.summary()["problem"] == "killed"
 

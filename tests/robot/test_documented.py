@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.time_to_hold import ALL
+from benchmarks.time_to_hold import ALL, NO_HOLD, shown
 from fluxvla_core.operators import SafetySettings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,6 +65,12 @@ def test_the_times_are_those_that_were_measured(rows):
 
     assert [row[0] for row in rows] == list(measured)
     for name, _, _, said, _ in rows:
-        found = measured[name]
-        wanted = {"refused": "nothing moves", "goes on": "goes on"}.get(found["outcome"])
-        assert said == (wanted or f"{found['median_s']:.2f} s"), name
+        assert said == shown(measured[name]), name
+
+
+def test_a_fault_after_which_nothing_is_sent_is_not_held_in_no_time(rows):
+    assert shown({"outcome": "stop", "median_s": 0.0}) == NO_HOLD
+    assert shown({"outcome": "stop", "median_s": 0.04}) == "0.04 s"
+    assert not any(row[3] == "0.00 s" for row in rows)
+    killed = "two processes: both killed (SIGKILL)"
+    assert [row[3] for row in rows if row[0] == killed] == [NO_HOLD]

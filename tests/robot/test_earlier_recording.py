@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluxvla_core.robot.recording.recorded import Recorded, open_recording
+from fluxvla_core.robot.recording.recorded import RecordedEpisode, open_recording
 
 pytest.importorskip("rosbags")
 
@@ -19,7 +19,7 @@ EXPECTED = json.loads(ROOT.with_name(f"{ROOT.name}.json").read_text(encoding="ut
 
 
 @pytest.fixture(scope="module")
-def recorded() -> Recorded:
+def recorded() -> RecordedEpisode:
     return open_recording(ROOT)
 
 
@@ -27,15 +27,15 @@ def digest(array: np.ndarray[Any, Any]) -> str:
     return hashlib.sha256(array.tobytes()).hexdigest()
 
 
-def test_what_it_is_of(recorded: Recorded) -> None:
+def test_what_it_is_of(recorded: RecordedEpisode) -> None:
     assert recorded.instruction == EXPECTED["instruction"]
     assert list(recorded.embodiment.joint_names) == EXPECTED["joints"]
-    for name in ("success", "whole", "native"):
-        assert getattr(recorded, name) is EXPECTED[name]
+    for name, key in (("success", "success"), ("finished", "whole"), ("native", "native")):
+        assert getattr(recorded, name) is EXPECTED[key]
     assert len(recorded.events) == EXPECTED["events"]
 
 
-def test_every_number_and_pixel_is_the_same(recorded: Recorded) -> None:
+def test_every_number_and_pixel_is_the_same(recorded: RecordedEpisode) -> None:
     times, commands = recorded.commands()
     assert digest(times) == EXPECTED["command_times"]
     assert [len(commands), digest(commands)] == EXPECTED["commands"]
@@ -48,13 +48,14 @@ def test_every_number_and_pixel_is_the_same(recorded: Recorded) -> None:
     assert [len(front), digest(images)] == EXPECTED["pictures"]
 
 
-def test_its_summary_is_counted_anew(recorded: Recorded) -> None:
+def test_its_summary_is_counted_anew(recorded: RecordedEpisode) -> None:
     summary = recorded.summary()
     assert summary["outcome"] == EXPECTED["outcome"]
     assert summary["steps"] == EXPECTED["steps"]
+    assert summary["skipped_ticks"] == 0  # it has ``skipped_beats``
 
 
-def test_it_can_be_replayed_as_robot_and_as_policy(bench: Any, recorded: Recorded) -> None:
+def test_it_can_be_replayed_as_robot_and_as_policy(bench: Any, recorded: RecordedEpisode) -> None:
     bench.run(
         record=str(bench.work_dir / "rec"),
         operator={"type": "ReplayOperator", "recording": str(ROOT)},

@@ -185,7 +185,7 @@ def test_a_state_that_is_not_finite_after_a_command(bench):
 def test_a_stream_that_froze(bench):
     bench.arm.faults["frozen_after"] = 20
 
-    fails(bench, SafetyStop, r"stream state is stale: its newest reading is \d\.\d\d s old")
+    fails(bench, SafetyStop, r"stream state is stale: its newest data is \d\.\d\d s old")
     assert_stopped(bench, "freshness", "stale")
 
 
@@ -215,11 +215,11 @@ def test_a_robot_that_never_gives_a_reading(bench):
     fails(
         bench,
         NotReady,
-        "no complete reading within 0.1 s: no joint states on /joint_states",
+        "no complete frame within 0.1 s: no joint states on /joint_states",
         ready_timeout=0.1,
     )
     assert bench.arm.sent == []
-    assert_stopped(bench, "operator", "no complete reading")
+    assert_stopped(bench, "operator", "no complete frame")
 
 
 @pytest.mark.realtime
@@ -230,7 +230,7 @@ def test_a_reading_that_is_old_moves_nothing(bench, make_arm):
     bench.arm.stamped = bench.arm.now() - 100
 
     error = fails(
-        bench, NotReady, "no complete reading within 1 s: stream state is stale", ready_timeout=1.0
+        bench, NotReady, "no complete frame within 1 s: stream state is stale", ready_timeout=1.0
     )
     assert "froze" in error.cause
     assert bench.arm.sent == []

@@ -173,5 +173,5 @@ def test_what_is_missing_is_waited_for(took):
     clock.time = 9.17
     assert not told, "questions are events by themselves"
     assert times(history.read()[1]) == pytest.approx([9.0, 9.1, 9.17])
-    assert [event.reading.observation["qpos"] for event in told] == pytest.approx([9.1])
+    assert [event.observed.observation["qpos"] for event in told] == pytest.approx([9.1])
     assert [event.at for event in told] == pytest.approx([9.1 + took])

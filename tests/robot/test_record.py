@@ -81,7 +81,7 @@ def test_ros_messages_say_which_joints_and_when(bench):
 def test_what_is_read_back_is_what_happened(bench):
     found = recorded(bench, max_publish_step=30)
 
-    assert found.whole
+    assert found.finished
     assert (found.instruction, found.success) == ("wave at the camera", False)
     times, commands = found.commands()
     np.testing.assert_array_equal(commands, bench.arm.sent)
@@ -92,7 +92,7 @@ def test_what_is_read_back_is_what_happened(bench):
         index = found.images["front"].newest(at)
         np.testing.assert_array_equal(found.images["front"].read(index), asked["images"]["front"])
     summary = json.loads((found.path / "episode.json").read_text())
-    assert summary.pop("dropped") == {"frames": 0, "pictures": 0, "events": 0}
+    assert summary.pop("dropped") == {"frames": 0, "images": 0, "events": 0}
     assert summary == found.summary()
 
 
@@ -160,7 +160,7 @@ def test_a_recording_is_whole_after_a_fault_and_has_the_cause(bench, fault, rule
         recorded(bench)
 
     found = open_recording(bench.work_dir / "rec")
-    assert found.whole
+    assert found.finished
     assert found.of("end")[0]["trips"][0]["rule"] == rule
     assert found.summary()["outcome"] == "failed"
     assert len(found.commands()[0]) > 5
@@ -220,7 +220,7 @@ def test_what_is_not_written_in_time_is_dropped_and_said(bench, monkeypatch):
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
     assert "images were not recorded: the disk or the processor did not keep up" in line
     summary = json.loads((bench.work_dir / "rec/001-1/episode.json").read_text())
-    assert summary["dropped"]["pictures"] > 0
+    assert summary["dropped"]["images"] > 0
 
 
 class Tapped:
@@ -246,7 +246,7 @@ def test_images_that_nobody_looked_at_are_recorded_where_the_robot_keeps_them(be
 
     times = np.diff(found.images["front"].times)
     arrived = np.count_nonzero(times > 1e-3)  # what was looked at lies in between
-    lost = json.loads((found.path / "episode.json").read_text())["dropped"]["pictures"]
+    lost = json.loads((found.path / "episode.json").read_text())["dropped"]["images"]
     assert found.native
     assert arrived + lost > 20
     assert (found.path / "front.mp4").stat().st_size > 0
@@ -290,16 +290,16 @@ def test_a_recording_is_readable_however_the_process_ends(tmp_path, ending):
     process.communicate(timeout=60)
 
     found = open_recording(record)
-    assert found.whole == (ending != signal.SIGKILL)
+    assert found.finished == (ending != signal.SIGKILL)
     times, commands = found.commands()
     assert len(commands) > 10
     assert len(found.chunks()) > 0
     assert found.images["front"].read(len(found.images["front"]) - 1).shape == (24, 32, 3)
-    outcome = "interrupted" if found.whole else "cut short"
+    outcome = "interrupted" if found.finished else "cut short"
     assert found.summary()["outcome"] == outcome
     assert np.diff(times).max() < 5
 
-    assert finish_recording(found.path) != found.whole
+    assert finish_recording(found.path) != found.finished
     assert open_recording(record).events == found.events
     assert connections(found.path)["/fluxvla/command"][1] == len(commands)
     assert sorted(p.name for p in record.iterdir()) == ["001-1"]

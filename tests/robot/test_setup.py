@@ -214,7 +214,7 @@ def test_without_a_checkpoint_there_is_no_policy(bench, tmp_path, monkeypatch):
         (folder / "config.resolved.json").write_text("{}")
     (trained / "checkpoints" / "step-000000003" / "manifest.json").write_text("{}")
     monkeypatch.chdir(tmp_path)
-    error = refused(bench, CheckpointError, "there is no whole checkpoint in", policy=None)
+    error = refused(bench, CheckpointError, "there is no undamaged checkpoint in", policy=None)
 
     assert error.next == (
         "train first (--section runner), or name the work dir of a training, such as "

@@ -48,7 +48,7 @@ def test_too_far_apart_is_refused_with_the_stream_that_is_late():
     assert str(caught.value) == (
         "cam is 0.450 s behind state; at most 0.1 s is allowed\n"
         "  likely cause: cam is late, or comes in bursts\n"
-        "  next: look at its driver's load, or allow more with max_skew_s"
+        "  next: look at its driver's load, or allow more with max_skew_s of the operator"
     )
 
 

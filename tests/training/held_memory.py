@@ -11,8 +11,8 @@ from torch import Tensor
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg, build_vla_from_cfg
 from fluxvla_core.training.cost import optimizer_bytes
+from fluxvla_core.training.dry_run import activations_of
 from fluxvla_core.training.model import ForwardArguments
-from fluxvla_core.training.rehearsal import kept_of
 
 
 def check_held(work_dir: Path, config: Mapping[str, Any], samples: Any, per_process: int) -> None:
@@ -33,7 +33,7 @@ def check_held(work_dir: Path, config: Mapping[str, Any], samples: Any, per_proc
     model, optimizer = runner.model, runner.optimizer
     runner.forward_arguments = ForwardArguments(model)
     batch = runner.collator([samples.get_sample(i, 0) for i in range(per_process)])
-    told = kept_of(bare, said, runner, batch)
+    told = activations_of(bare, said, runner, batch)
 
     kept: dict[int, int] = {}
     held: list[Any] = []  # so that no other storage gets the place of one counted

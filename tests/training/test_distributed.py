@@ -112,7 +112,7 @@ def test_devices_that_are_not_there_are_refused(monkeypatch):
     monkeypatch.setenv("LOCAL_RANK", "1")
     with pytest.raises(ConfigError, match=r"process 2 .* no GPU of its own: torch sees 1") as found:
         start("auto")
-    assert "--nproc 1, or --set runner.device=cpu" in str(found.value)
+    assert "--nproc 1, or --set <section>.device=cpu" in str(found.value)
 
 
 def test_a_lost_rank_is_explained_and_other_errors_are_not():

@@ -19,7 +19,7 @@ from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.policies.loading import load_policy
 from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from fluxvla_core.training.export import export
-from fluxvla_core.training.weights import left_out
+from fluxvla_core.training.weights import external_weights
 
 ARM = EmbodimentSpec(
     "arm",
@@ -31,22 +31,22 @@ ROW = {"mean": [0.1, 0.2], "std": [0.5, 2.0]}
 
 
 class ActsVLA(torch.nn.Module):
-    """A trained gain, a part that it brings itself, and a weight under two names."""
+    """A trained gain, a frozen part from a package, and a weight under two names."""
 
     action_shape = (4, 2)
 
     def __init__(self):
         super().__init__()
         self.gain = torch.nn.Linear(2, 2)
-        self.brought = torch.nn.Linear(2, 2).requires_grad_(False)
+        self.frozen = torch.nn.Linear(2, 2).requires_grad_(False)
         self.tied = self.gain
         with torch.no_grad():
-            self.brought.weight.fill_(3.0)
-            self.brought.bias.fill_(1.0)
-        self.brought.frozen_source = "a package"
+            self.frozen.weight.fill_(3.0)
+            self.frozen.bias.fill_(1.0)
+        self.frozen.frozen_source = "a package"
 
     def predict_action(self, images, states, noise):
-        return self.brought(self.gain(noise)) + states[:, None]
+        return self.frozen(self.gain(noise)) + states[:, None]
 
 
 @pytest.fixture(autouse=True)
@@ -71,7 +71,7 @@ def saved(work_dir, ema=True):
     origins = {"model.type": "c.py:1", "runner.type": "c.py:2"}
     weights = {"gain.weight": torch.eye(2) * 2, "gain.bias": torch.tensor([0.5, -0.5])}
     tied = {f"tied.{n.partition('.')[2]}": t.clone() for n, t in weights.items()}
-    brings = left_out(ActsVLA()).to_dict()
+    external = external_weights(ActsVLA()).to_dict()
     with CheckpointWriter(work_dir, 7, 1) as writer:
         writer.write_bytes("model.safetensors", save({**weights, **tied}))
         if ema:
@@ -89,7 +89,7 @@ def saved(work_dir, ema=True):
         writer.write_json("embodiment.json", ARM.to_dict())
         writer.write_json("environment.json", {"torch": "2"})
         writer.write_json("policy.json", {"action_rate_hz": 10.0, "horizon": 4})
-        writer.write_json("trainer.json", {"left_out": brings})
+        writer.write_json("trainer.json", {"left_out": external})
         writer.write_bytes("processors/tokenizer/t.json", b"{}")
         return writer.commit()
 
@@ -133,9 +133,9 @@ def test_an_export_acts_as_the_checkpoint_does(tmp_path, capsys, ema):
 def test_all_weights_are_in_one_plain_file(tmp_path):
     target = export(saved(tmp_path / "run"), tmp_path / "out")
     found = load_file(target / "model.safetensors")
-    assert set(found) == {"gain.weight", "gain.bias", "brought.weight", "brought.bias"}
+    assert set(found) == {"gain.weight", "gain.bias", "frozen.weight", "frozen.bias"}
     assert torch.equal(found["gain.weight"], torch.eye(2) * 2 + 0.25)
-    # What the model brings may change with its package: the export keeps what it was.
+    # The frozen part may change with its package: the export keeps what it was.
     assert Checkpoint.open(target).json("trainer.json")["left_out"]["sha256"] == ""
 
 

@@ -1,6 +1,6 @@
-"""The training flaws of the field notes, one by one, where no other test is about just that.
+"""Bugs of upstream FluxVLA's training, one by one, where no other test is about just that.
 
-``NUMBERS`` lists them all. Tests say which one they are about as "T4 of the field notes".
+``NUMBERS`` lists them all. Tests say which one they are about as "T4 of upstream's bugs".
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def test_each_of_them_has_a_test_that_says_so():
     said = {
         number
         for text in docstrings()
-        for listed in re.findall(r"((?:\b[TDOP]\d+\b(?:, | and )?)+) of the field notes", text)
+        for listed in re.findall(r"((?:\b[TDOP]\d+\b(?:, | and )?)+) of upstream's bugs", text)
         for number in re.findall(r"[TDOP]\d+", listed)
     }
     assert [number for number in NUMBERS if number not in said] == []
@@ -82,7 +82,7 @@ def resumed_and_looked_at(run):
 
 
 def test_every_rank_has_the_weights_and_the_optimizer_again(tmp_path):
-    """T1 of the field notes: a strategy's own resume() never restored the model's weights."""
+    """T1 of upstream's bugs: a strategy's own resume() never restored the model's weights."""
     run = go_on(tmp_path, "DDPTrainRunner")
     assert run_ranks(2, train, run) == [0, 0]
     assert run_ranks(2, resumed_and_looked_at, run) == [0, 0]
@@ -91,7 +91,7 @@ def test_every_rank_has_the_weights_and_the_optimizer_again(tmp_path):
 @pytest.mark.parametrize("kind", ["OneProcessRunner", "DDPTrainRunner", "FSDPTrainRunner"])
 @pytest.mark.parametrize("length", [{"max_steps": 5}, {"max_epochs": 1}])
 def test_either_length_is_enough_and_its_end_is_saved(tmp_path, kind, length):
-    """T4 and T5 of the field notes: a default max_epochs tripped over max_steps; an interval
+    """T4 and T5 of upstream's bugs: a default max_epochs tripped over max_steps; an interval
     beyond the end saved nothing.
     """
     config = tiny_config({"type": kind, "save_iter_interval": 1000, **length})
@@ -100,7 +100,7 @@ def test_either_length_is_enough_and_its_end_is_saved(tmp_path, kind, length):
 
 
 def test_small_updates_are_not_lost_in_mixed_precision(tmp_path):
-    """T6 of the field notes: bf16 weights of 1.0 stood still under AdamW at a rate of 5e-5."""
+    """T6 of upstream's bugs: bf16 weights of 1.0 stood still under AdamW at a rate of 5e-5."""
     table = {"type": "OneProcessRunner", "max_steps": 20, "learning_rate": 5e-5}
     config = tiny_config({**table, "enable_mixed_precision_training": True, "weight_decay": 0.0})
     runner = train({"config": config, "work_dir": str(tmp_path)})
@@ -154,7 +154,7 @@ PUBLISHED = {
 
 
 def test_nothing_reads_or_writes_a_pickle():
-    """T9 and T11 of the field notes: torch.save to the final name, torch.load on every rank."""
+    """T9 and T11 of upstream's bugs: torch.save to the final name, torch.load on every rank."""
     places = [ROOT / "src", *(ROOT / "plugins").glob("*/src")]
     paths = [path for place in places for path in place.rglob("*.py")]
     assert len({path.relative_to(ROOT).parts[:2] for path in paths}) > 5
@@ -168,7 +168,7 @@ def test_nothing_reads_or_writes_a_pickle():
 
 
 def test_merged_statistics_do_not_shrink_with_the_width():
-    """D1 of the field notes: the merged deviation was sqrt(D) too small."""
+    """D1 of upstream's bugs: the merged deviation was sqrt(D) too small."""
     import numpy as np
 
     from fluxvla_core.data.statistics import column_statistics
@@ -181,7 +181,7 @@ def test_merged_statistics_do_not_shrink_with_the_width():
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_every_epoch_has_an_order_of_its_own(tmp_path, workers):
-    """D2 of the field notes: the same order in every epoch, with 0 workers whatever was asked."""
+    """D2 of upstream's bugs: the same order in every epoch, with 0 workers whatever was asked."""
     seen = []
 
     class Watching(TinyDataset):
@@ -206,7 +206,7 @@ def test_every_epoch_has_an_order_of_its_own(tmp_path, workers):
 
 
 def test_ranks_of_two_machines_draw_different_numbers(monkeypatch):
-    """D3 of the field notes: LOCAL_RANK was taken for the rank, and was a KeyError when alone."""
+    """D3 of upstream's bugs: LOCAL_RANK was taken for the rank, and was a KeyError when alone."""
     for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE"):
         monkeypatch.delenv(name, raising=False)
     alone = start("cpu")
@@ -234,7 +234,7 @@ def test_noise_belongs_to_the_sample_and_not_to_the_rank():
 
 
 def test_no_tracker_that_was_not_asked_for_is_touched(tmp_path, monkeypatch):
-    """O2 of the field notes: wandb.log was called whatever the trackers were; O1: a hard import."""
+    """O2 of upstream's bugs: wandb.log was called whatever the trackers were; O1: a hard import."""
     for name in ("wandb", "tensorboard", "trackio"):
         monkeypatch.setitem(sys.modules, name, None)
     train(go_on(tmp_path, "DDPTrainRunner", max_steps=12))
@@ -257,7 +257,7 @@ def test_the_device_is_waited_for_every_few_steps_only(tmp_path, monkeypatch):
 
 
 def test_plain_python_trains_without_a_gpu_or_a_launcher(tmp_path, monkeypatch):
-    """P1 of the field notes: without CUDA, NCCL and torchrun it died at the first barrier."""
+    """P1 of upstream's bugs: without CUDA, NCCL and torchrun it died at the first barrier."""
     for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -267,7 +267,7 @@ def test_plain_python_trains_without_a_gpu_or_a_launcher(tmp_path, monkeypatch):
 
 
 def test_runners_and_operators_have_suites_that_need_no_gpu():
-    """P2 of the field notes: no test of a runner, an operator or of resuming."""
+    """P2 of upstream's bugs: no test of a runner, an operator or of resuming."""
     from fluxvla_core.testing import operator, train_runner
 
     suites = [train_runner.TrainRunnerConformance, operator.OperatorConformance]

@@ -76,8 +76,11 @@ def on_meta(**settings: Any) -> Stack:
 def test_what_autograd_keeps_is_counted_without_memory(dtype: Any) -> None:
     real, again = Stack(), Stack()
     checkpoint_activations(again)
-    kept, left = cost.kept(real, BATCH, dtype), cost.kept(again, BATCH, dtype)
-    told = cost.kept_by_fake(cost.fake(on_meta()), BATCH, dtype)
+    kept, left = (
+        cost.saved_activations(real, BATCH, dtype),
+        cost.saved_activations(again, BATCH, dtype),
+    )
+    told = cost.fake_activations(cost.fake(on_meta()), BATCH, dtype)
     # The statistics of norms of bf16 inputs are fp32 on a CPU, and bf16 where nothing is computed.
     margin = 0.01 if dtype else 0
     assert told.activations == pytest.approx(kept.activations, rel=margin)
@@ -100,13 +103,13 @@ def test_what_is_kept_is_counted_by_hand() -> None:
         def forward(self, x: Any) -> dict[str, Any]:
             return {"loss": self.second(self.first(x)).square().mean()}
 
-    kept = cost.kept(One(), {"x": torch.zeros(2, 6)}, None)
+    kept = cost.saved_activations(One(), {"x": torch.zeros(2, 6)}, None)
     assert kept.activations == 4 * (2 * 5 + 2 * 3)
     assert (kept.batch, kept.weight_copies) == (4 * 2 * 6, 0)
 
 
 def test_recomputing_keeps_what_goes_into_units_and_tells_of_the_largest() -> None:
-    kept = cost.kept_by_fake(cost.fake(on_meta()), BATCH, None)
+    kept = cost.fake_activations(cost.fake(on_meta()), BATCH, None)
     found = replicated_layout(on_meta())
     plain, again = (cost.footprint(found, kept, 0, False, r) for r in (False, True))
     assert (plain.activations, plain.recomputed) == (kept.activations, 0)
@@ -119,7 +122,7 @@ def test_recomputing_keeps_what_goes_into_units_and_tells_of_the_largest() -> No
 def test_a_model_that_decides_by_numbers_cannot_be_counted() -> None:
     counted = cost.fake(on_meta(decides="count"))
     with pytest.raises(Exception, match="_local_scalar_dense"):
-        cost.kept_by_fake(counted, BATCH, None)
+        cost.fake_activations(counted, BATCH, None)
 
 
 @pytest.mark.parametrize("settings", [AdamW(), AdamW(fused=False), SGD(), SGD(momentum=0.0)])
@@ -145,7 +148,7 @@ def test_what_one_process_alone_keeps() -> None:
 
 def test_the_sum_and_the_averages() -> None:
     found = replicated_layout(on_meta())
-    kept = cost.Kept(5, recomputed=2, largest_unit=3, weight_copies=7, batch=11)
+    kept = cost.SavedActivations(5, recomputed=2, largest_unit=3, weight_copies=7, batch=11)
     whole = cost.footprint(found, kept, 13, True, False)
     assert whole.averages == found.gradients
     assert whole.total == found.parameters + 2 * found.gradients + 13 + 5 + 7 + 11

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
@@ -21,95 +21,18 @@ from fluxvla_core.checkpoints.foreign import (
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError, IncompatiblePlugin, SpecMismatch, UsageError
 from fluxvla_core.models import (
-    CheckpointFormat,
-    ForeignCheckpoint,
     chosen_robot,
-    renamed,
-    safetensors_in,
     without_cameras,
 )
-from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS, VLAS
+from fluxvla_core.plugins.registry import CHECKPOINT_FORMATS
 from fluxvla_core.policies.loading import load_policy
-from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
+from fluxvla_core.spec import EmbodimentSpec, Joint
 from fluxvla_core.testing.training import TinyDataset, tiny_config
 from fluxvla_core.training.export import embodiment_in, export_foreign, import_checkpoint
 
-ARM = EmbodimentSpec(
-    "arm",
-    tuple(Joint(n, "rad", -1.0, 1.0, 1.0, 1.0) for n in "ab"),
-    (Camera("front", 8, 8),),
-    50.0,
-)
-ROW = {"mean": [0.1, 0.2], "std": [0.5, 2.0]}
-NAMES = {"gain.weight": "net.w", "gain.bias": "net.b", "head.weight": "net.w", "scale": "s"}
+from .reach import ARM, ROW, ReachFormat, plugin, published, weights
 
-
-class ReachVLA(torch.nn.Module):
-    """A weight under two names, and one number."""
-
-    action_shape = (4, 2)
-
-    def __init__(self, pretrained_name_or_path: str | None = None):
-        super().__init__()
-        self.gain = torch.nn.Linear(2, 2)
-        self.head = torch.nn.Linear(2, 2, bias=False)
-        self.head.weight = self.gain.weight
-        self.scale = torch.nn.Parameter(torch.ones(()))
-        self.pretrained_name_or_path = pretrained_name_or_path
-
-    def forward(self, x, y):
-        return {"loss": (self.scale * self.head(self.gain(x)) - y).square().mean()}
-
-    def predict_action(self, states, noise):
-        return self.scale * self.head(self.gain(noise)) + states[:, None]
-
-
-class ReachFormat(CheckpointFormat):
-    name = "reach"
-    model_types = ("ReachVLA",)
-
-    def recognizes(self, folder):
-        return (folder / "reach.json").is_file()
-
-    def read(self, folder, tokenizer=None):
-        facts = json.loads((folder / "reach.json").read_text())
-        return ForeignCheckpoint(
-            model={"type": "ReachVLA"},
-            tensors=renamed(safetensors_in(folder), NAMES, str(folder)),
-            img_keys=("base",),
-            transforms=({"type": "NormalizeStatesAndActions", "norm_type": "mean_std"},),
-            statistics={"private": {"proprio": ROW, "action": ROW}},
-            horizon=4,
-            action_rate_hz=facts.get("hz"),
-            notes=("the wrist camera is not used",),
-        )
-
-    def write(self, checkpoint, folder):
-        tensors = {theirs: checkpoint.tensors[ours] for ours, theirs in NAMES.items()}
-        save_file(tensors, folder / "model.safetensors")
-        (folder / "reach.json").write_text(json.dumps({"hz": checkpoint.action_rate_hz}))
-
-
-@pytest.fixture(autouse=True)
-def plugin():
-    VLAS.register_module()(ReachVLA)
-    CHECKPOINT_FORMATS.register_module()(ReachFormat)
-    yield
-    VLAS.unregister("ReachVLA")
-    CHECKPOINT_FORMATS.unregister("ReachFormat")
-
-
-def weights():
-    torch.manual_seed(0)
-    made = {"net.w": torch.randn(2, 2), "net.b": torch.randn(2), "s": torch.tensor(1.5)}
-    return {name: tensor.bfloat16() for name, tensor in made.items()}
-
-
-def published(folder, tensors=None, hz=10.0):
-    folder.mkdir()
-    save_file(weights() if tensors is None else tensors, folder / "model.safetensors")
-    (folder / "reach.json").write_text(json.dumps({"hz": hz}))
-    return folder
+__all__ = ["plugin"]
 
 
 def test_an_imported_checkpoint_acts(tmp_path, capsys):
@@ -389,72 +312,6 @@ def test_a_write_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
     with pytest.raises(CheckpointError, match="it does not fit"):
         export_foreign(out, tmp_path / "out" / "back", "reach")
     assert list((tmp_path / "out").iterdir()) == []
-
-
-def in_parts(folder, weight_map=None):
-    folder.mkdir()
-    (folder / "reach.json").write_text("{}")
-    named = {}
-    for place, (name, tensor) in enumerate(weights().items(), 1):
-        file = f"model-{place:05d}-of-00003.safetensors"
-        save_file({name: tensor}, folder / file)
-        named[name] = file
-    index = {"metadata": {}, "weight_map": {**named, **(weight_map or {})}}
-    (folder / "model.safetensors.index.json").write_text(json.dumps(index))
-    return folder
-
-
-def test_weights_in_several_files(tmp_path):
-    out, found = import_checkpoint(in_parts(tmp_path / "theirs"), tmp_path / "ours")
-    whole, _ = import_checkpoint(published(tmp_path / "one", hz=None), tmp_path / "other")
-    assert found.action_rate_hz is None
-    first, second = (load_file(p / "model.safetensors") for p in (out, whole))
-    assert all(torch.equal(first[name], second[name]) for name in first.keys() | second.keys())
-
-
-@pytest.mark.parametrize(
-    ("weight_map", "words"),
-    [
-        ({"net.x": "model-00001-of-00003.safetensors"}, "no file has 'net.x', which is listed"),
-        ({"net.x": "../secret.safetensors"}, "'../secret.safetensors' is not a file next to it"),
-        ({"net.x": 3}, "weight_map: no table of file names"),
-        ({"net.x": "gone.safetensors"}, "gone.safetensors cannot be read"),
-    ],
-)
-def test_an_index_that_lies(tmp_path, weight_map, words):
-    with pytest.raises(CheckpointError, match=words):
-        safetensors_in(in_parts(tmp_path / "theirs", weight_map))
-
-
-def hub_cache(folder, monkeypatch):
-    """The hub's cache with one model in it, and no way to the hub."""
-    pytest.importorskip("huggingface_hub")
-    from huggingface_hub import constants
-
-    revision = "0123456789abcdef0123456789abcdef01234567"
-    repository = folder / "models--acme--reach"
-    (repository / "refs").mkdir(parents=True)
-    (repository / "refs" / "main").write_text(revision)
-    (repository / "snapshots").mkdir()
-    published(repository / "snapshots" / revision)
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(folder))
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-
-
-def test_one_on_the_hub(tmp_path, monkeypatch):
-    hub_cache(tmp_path / "cache", monkeypatch)
-    out, _ = import_checkpoint("hf:acme/reach", tmp_path / "ours")
-    assert torch.equal(load_file(out / "model.safetensors")["scale"], weights()["s"])
-    with pytest.raises(CheckpointError, match="hf:acme/other cannot be fetched"):
-        import_checkpoint("hf:acme/other", tmp_path / "more")
-    with pytest.raises(CheckpointError, match="hf:a/b/c cannot be fetched"):
-        import_checkpoint("hf:a/b/c", tmp_path / "more")
-
-
-def test_a_typo_never_asks_the_hub(tmp_path):
-    with pytest.raises(CheckpointError, match="acme/reach does not exist") as caught:
-        import_checkpoint("acme/reach", tmp_path / "ours")
-    assert "hf:OWNER/NAME" in str(caught.value)
 
 
 def test_weights_of_another_family_name_both():

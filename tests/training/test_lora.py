@@ -22,7 +22,12 @@ from fluxvla_core.testing.training import (
 from fluxvla_core.training import lora
 from fluxvla_core.training.export import export
 from fluxvla_core.training.lora import LoraOptions
-from fluxvla_core.training.weights import base_of, base_to_note, load_for_inference, start_from
+from fluxvla_core.training.weights import (
+    adapter_base_place,
+    adapter_base_to_record,
+    load_for_inference,
+    load_initial_weights,
+)
 
 pytest.importorskip("peft")
 
@@ -68,7 +73,7 @@ def loss_of(model):
 
 
 def test_only_the_adapter_is_trained_and_saved(tmp_path, base):
-    """T2 of the field notes: merged weights were saved, and the adapter was not rotated."""
+    """T2 of upstream's bugs: merged weights were saved, and the adapter was not rotated."""
     runner = run(tmp_path, init_from=str(base), lora=LORA, save_iter_interval=2, max_keep_ckpts=2)
     found = latest(tmp_path)
     assert {n for n in found.manifest.files if n.startswith("adapter/")} == {
@@ -104,7 +109,7 @@ def test_it_goes_on_bit_for_bit(tmp_path, base):
 def test_the_base_is_another_runs_weights(tmp_path, base):
     run(tmp_path, init_from=str(base), lora=LORA, max_steps=1)
     started = TinyVLA()
-    start_from(started, base)
+    load_initial_weights(started, base)
     acts = TinyVLA()
     load_for_inference(acts, latest(tmp_path))
     assert torch.equal(acts.encoder.weight, started.encoder.weight)
@@ -120,7 +125,7 @@ def test_peft_reads_the_adapter_and_agrees_with_the_merged_model(tmp_path, base)
     found = latest(tmp_path)
     merged, plain = TinyVLA(), TinyVLA()
     load_for_inference(merged, found)
-    start_from(plain, base)
+    load_initial_weights(plain, base)
     assert set(merged.state_dict()) == set(plain.state_dict())
     assert [p.requires_grad for p in merged.parameters()] == [
         p.requires_grad for p in plain.parameters()
@@ -230,7 +235,7 @@ def test_a_run_that_goes_on_names_the_base_that_it_had(tmp_path, base, monkeypat
     run("other", "auto", **settings, init_from="base", max_steps=6)
     monkeypatch.chdir((tmp_path / "here").rename(tmp_path / "there"))
     plain = TinyVLA()
-    start_from(plain, "base")
+    load_initial_weights(plain, "base")
     for place, step in (("run", 4), ("other", 6)):
         found, acts = latest(place), TinyVLA()
         assert found.step == step
@@ -239,14 +244,14 @@ def test_a_run_that_goes_on_names_the_base_that_it_had(tmp_path, base, monkeypat
         assert torch.equal(acts.encoder.weight, plain.encoder.weight)
 
 
-def test_what_a_model_brings_itself_is_no_base(tmp_path):
+def test_weights_from_a_package_are_no_base(tmp_path):
     left_out = {"sources": {"": "package:words 1.0"}, "sha256": "0"}
     with CheckpointWriter(tmp_path, 1, 0) as writer:
         writer.write_json(lora.CONFIG, LoraOptions.read(LORA, None).for_peft())
         writer.write_json("trainer.json", {"left_out": left_out})
         found = Checkpoint.open(writer.commit())
-    assert base_of(found) is base_of(found, "elsewhere") is None
-    assert base_to_note(found, None) is base_to_note(found, "elsewhere") is None
+    assert adapter_base_place(found) is adapter_base_place(found, "elsewhere") is None
+    assert adapter_base_to_record(found, None) is adapter_base_to_record(found, "elsewhere") is None
 
 
 def test_going_on_with_another_base_names_both(tmp_path, base):
@@ -258,7 +263,7 @@ def test_going_on_with_another_base_names_both(tmp_path, base):
     assert (
         f"was trained with (the model from {now}; then from {before})\n"
         "  likely cause: init_from was changed, or that place has other weights by now\n"
-        f"  next: --set runner.init_from=DIR, where the weights of {before} are; or resume "
+        f"  next: --set <section>.init_from=DIR, where the weights of {before} are; or resume "
         "without it"
     ) in str(caught.value)
     shutil.copytree(base, tmp_path / "copy")
@@ -291,7 +296,7 @@ def test_with_and_without_an_adapter_are_two_models(tmp_path, base):
     with pytest.raises(CheckpointError) as caught:
         run(tmp_path, "auto", init_from=str(base))
     assert caught.value.what == "lora is not set, the checkpoint's run had rank=2, alpha=4"
-    assert "begin another run from these weights: --set runner.init_from=" in str(caught.value)
+    assert "begin another run from these weights: --set '<section>.init_from=" in str(caught.value)
     other = {**LORA, "rank": 3, "target_modules": ["head", "linear"]}
     with pytest.raises(CheckpointError) as caught:
         run(tmp_path, "auto", init_from=str(base), lora=other)
@@ -327,9 +332,9 @@ def test_a_safetensors_file_to_start_from(tmp_path, base):
     load_for_inference(model, latest(base))
     assert torch.equal(runner.model.head.weight, model.head.weight)
     with pytest.raises(CheckpointError, match=r"there are no weights at .*gone\.safetensors"):
-        start_from(model, tmp_path / "gone.safetensors")
+        load_initial_weights(model, tmp_path / "gone.safetensors")
     with pytest.raises(CheckpointError, match="the weights of the checkpoint are not this model's"):
-        start_from(TinyVLA(width=16), latest(base).path / "model.safetensors")
+        load_initial_weights(TinyVLA(width=16), latest(base).path / "model.safetensors")
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def rows(path):
 
 
 def test_one_record_a_step(tmp_path):
-    """O1 of the field notes: numbers as numbers, and nothing that is a constant."""
+    """O1 of upstream's bugs: numbers as numbers, and nothing that is a constant."""
     metric = VLAMetric(run_dir=str(tmp_path))
     metric.start(0, {})
     measured = {"step_time": 0.1, "samples_per_s": 80.0, "data_wait": 0.0}

@@ -84,7 +84,7 @@ class Units(nn.Module):
 
 
 def test_recomputing_changes_no_gradient_and_no_name():
-    """T13 of the field notes: activation checkpointing assumed attribute names."""
+    """T13 of upstream's bugs: activation checkpointing assumed attribute names."""
     grads = []
     for recompute in (False, True):
         net = Units()

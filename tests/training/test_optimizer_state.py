@@ -64,7 +64,7 @@ def test_a_model_without_anything_to_train_is_refused():
 
 
 def test_master_weights_move_by_small_steps():
-    """T6 of the field notes: at 1.0, under steps of 5e-5, a bf16 weight would stand still."""
+    """T6 of upstream's bugs: at 1.0, under steps of 5e-5, a bf16 weight would stand still."""
     net = nn.Linear(1, 1, bias=False)
     nn.init.ones_(net.weight)
     optimizer = make_adamw(net, 5e-5, 0.0)

@@ -64,13 +64,13 @@ def test_all_findings_at_once_with_their_places():
 
 
 def test_an_unknown_key_is_refused():
-    """T12 of the field notes: a misspelt key gave a constant learning rate."""
+    """T12 of upstream's bugs: a misspelt key gave a constant learning rate."""
     with pytest.raises(ConfigError, match="got an unexpected keyword argument 'lr_scheduler'"):
         runner(lr_scheduler="linear-warmup+cosine-decay")
 
 
 def test_step_based_runs_need_no_epochs():
-    """T5 of the field notes: a default of max_epochs made max_steps unusable."""
+    """T5 of upstream's bugs: a default of max_epochs made max_steps unusable."""
     assert runner(max_steps=5).max_epochs is None
 
 

@@ -13,7 +13,7 @@ from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import PartWeights
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.testing.training import TinyDataset, tiny_config
-from fluxvla_core.training.weights import put_parts, tensors_at
+from fluxvla_core.training.part_weights import load_part_weights, tensors_at
 
 NAMES = {"tower.": "vision.model."}
 
@@ -68,7 +68,7 @@ def test_a_part_gets_its_weights_and_the_rest_stays(tmp_path, name):
     model = TwoParts()
     before = model.head.weight.detach().clone()
 
-    put_parts(model, [PartWeights(saved(tmp_path / name), NAMES)])
+    load_part_weights(model, [PartWeights(saved(tmp_path / name), NAMES)])
 
     for own, theirs in ((model.tower[i], f"vision.model.{i}") for i in (0, 1)):
         assert torch.equal(own.weight, weights()[f"{theirs}.weight"])
@@ -94,7 +94,7 @@ def test_what_does_not_correspond_is_listed(tmp_path, change, words):
     model = TwoParts()
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     with pytest.raises(CheckpointError, match=words) as caught:
-        put_parts(model, [PartWeights(place, NAMES)])
+        load_part_weights(model, [PartWeights(place, NAMES)])
     assert "'tower.' is 'vision.model.' there" in str(caught.value)
     assert all(torch.equal(t, before[n]) for n, t in model.state_dict().items())
 
@@ -102,7 +102,7 @@ def test_what_does_not_correspond_is_listed(tmp_path, change, words):
 def test_what_nothing_reads_may_be_named(tmp_path):
     tensors = {**weights(), "vision.head.weight": torch.zeros(2)}
     place = saved(tmp_path / "tower.safetensors", tensors)
-    put_parts(TwoParts(), [PartWeights(place, NAMES, ("vision.head.",))])
+    load_part_weights(TwoParts(), [PartWeights(place, NAMES, ("vision.head.",))])
 
 
 def test_the_longest_of_several_names_counts(tmp_path):
@@ -110,7 +110,7 @@ def test_the_longest_of_several_names_counts(tmp_path):
     moved = {n.replace("vision.model.1.", "last."): t for n, t in tensors.items()}
     place = saved(tmp_path / "tower.safetensors", moved)
     model = TwoParts()
-    put_parts(model, [PartWeights(place, {**NAMES, "tower.1.": "last."})])
+    load_part_weights(model, [PartWeights(place, {**NAMES, "tower.1.": "last."})])
     assert torch.equal(model.tower[1].weight, tensors["vision.model.1.weight"])
 
 
@@ -119,7 +119,7 @@ def test_a_part_that_the_model_does_not_have(tmp_path):
     with pytest.raises(
         CheckpointError, match=r"no weight of the model has 'towel\.' in its"
     ) as caught:
-        put_parts(TwoParts(), [PartWeights(place, {"towel.": "vision.model."})])
+        load_part_weights(TwoParts(), [PartWeights(place, {"towel.": "vision.model."})])
     assert "the model's parts are tower, head" in str(caught.value)
 
 

@@ -130,7 +130,7 @@ def resume_error(tmp_path, length=37, **settings):
 
 
 def test_another_models_checkpoint_is_refused(tmp_path):
-    """T3, T8 of the field notes: wrong weights and optimizer states resumed with a warning."""
+    """T3, T8 of upstream's bugs: wrong weights and optimizer states resumed with a warning."""
     message = resume_error(tmp_path, model={"width": 16})
     assert "the weights of the checkpoint are not this model's" in message
     assert "of another size: blocks.0.linear.bias: (8,) in the checkpoint, (16,) here" in message
@@ -184,8 +184,8 @@ def test_averages_are_not_dropped_without_a_word(tmp_path):
         f"{tmp_path}/checkpoints/step-000000002: ema_decay is not set, and the checkpoint's run "
         "kept averaged weights, which are used for inference\n"
         "  next: set it back: the checkpoint's config.resolved.json has its value; or begin "
-        "another run from these weights: --set runner.init_from="
-        f"{tmp_path}/checkpoints/step-000000002 --work-dir OTHER"
+        "another run from these weights: --set '<section>.init_from="
+        f"{tmp_path}/checkpoints/step-000000002' --work-dir OTHER"
     )
 
 
@@ -307,7 +307,7 @@ def test_a_work_dir_that_is_removed_ends_the_run_and_is_not_made_again(
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_saves_and_the_run_goes_on_exactly(tmp_path, number):
-    """O3 of the field notes: no SIGTERM handling."""
+    """O3 of upstream's bugs: no SIGTERM handling."""
 
     class Interrupting(TinyDataset):
         def get_sample(self, index, epoch):

@@ -43,7 +43,7 @@ def test_what_a_dataset_doubts_is_said_before_the_first_step(tmp_path):
 
 
 def test_a_run_ends_with_a_checkpoint_that_is_enough_by_itself(tmp_path):
-    """T4 of the field notes: the final state was not saved."""
+    """T4 of upstream's bugs: the final state was not saved."""
     said = Said()
     run(tmp_path, reporter=said, ema_decay=0.9)
     found = latest(tmp_path)
@@ -146,7 +146,7 @@ def test_a_few_episodes_at_a_time(tmp_path):
 
 
 def test_an_optimizer_that_is_not_taken_is_an_error(tmp_path, monkeypatch):
-    """T8 of the field notes: training went on with a fresh optimizer."""
+    """T8 of upstream's bugs: training went on with a fresh optimizer."""
     run(tmp_path, max_steps=2)
     runner = make(tmp_path, resume="auto")
     monkeypatch.setattr(type(runner), "_load_optimizer_state", lambda self, state: False)
@@ -224,7 +224,7 @@ def test_accumulation_equals_the_big_batch(tmp_path):
 
 
 def test_bf16_computes_over_fp32_weights(tmp_path):
-    """T6 of the field notes: weights themselves were bf16."""
+    """T6 of upstream's bugs: weights themselves were bf16."""
     plain = run(tmp_path / "a", max_steps=2)
     mixed = run(tmp_path / "b", max_steps=2, enable_mixed_precision_training=True)
     weights = latest(tmp_path / "b").tensors("model.safetensors")
@@ -257,7 +257,7 @@ def test_two_workers_change_nothing(tmp_path):
 
 
 def test_the_seed_makes_the_run(tmp_path):
-    """T7 of the field notes: training was never seeded."""
+    """T7 of upstream's bugs: training was never seeded."""
     found = []
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         run(tmp_path / name, seed=seed)

@@ -102,7 +102,7 @@ def test_a_strategy_that_tells_no_norm_has_none():
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_loss_that_is_not_finite_names_step_and_samples(bad):
-    """O3 of the field notes: no NaN detection."""
+    """O3 of upstream's bugs: no NaN detection."""
     window = StepMetrics(ONE)
     add(window, 1, 1.0, 2.0)
     add(window, 2, 1.0, bad)
@@ -152,7 +152,7 @@ def two_ranks(folder):
 
 
 def test_losses_are_of_all_ranks_and_every_rank_hears_of_another_ones_nan(tmp_path):
-    """O1 of the field notes: the logged loss was the first rank's."""
+    """O1 of upstream's bugs: the logged loss was the first rank's."""
     assert run_ranks(2, two_ranks, tmp_path) == [0, 0]
     said = [(tmp_path / str(rank)).read_text() for rank in range(2)]
     assert (

@@ -92,7 +92,7 @@ def test_a_tracker_without_its_package_is_refused_before_training(monkeypatch):
 
 
 def test_a_failing_tracker_is_warned_of_once(tmp_path):
-    """O2 of the field notes: what watches a run never ends it."""
+    """O2 of upstream's bugs: what watches a run never ends it."""
     said = Said()
     tracker = jsonl(tmp_path, reporter=said)
     tracker._tracker._file.close()

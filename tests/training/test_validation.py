@@ -51,7 +51,7 @@ def by_hand(folder):
 
 @pytest.mark.parametrize("ema_decay", [None, 0.9])
 def test_it_is_the_loss_of_the_weights_that_act(tmp_path, ema_decay):
-    """O3 of the field notes: no validation split."""
+    """O3 of upstream's bugs: no validation split."""
     run(tmp_path, val_iter_interval=3, save_iter_interval=1, ema_decay=ema_decay)
     found = losses(tmp_path)
     assert list(found) == [3, 6, 8]
@@ -269,7 +269,7 @@ def test_one_that_is_made_up_for_in_another_work_dir_is_kept_there(tmp_path, mon
 
 
 def test_no_better_loss_for_long_enough_ends_the_run(tmp_path):
-    """O3 of the field notes: no early stop."""
+    """O3 of upstream's bugs: no early stop."""
     settings = {"val_iter_interval": 1, "learning_rate": 3.0, "early_stop_patience": 2}
     runner = run(tmp_path, max_steps=500, **settings)
     found = losses(tmp_path)

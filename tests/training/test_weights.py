@@ -17,7 +17,7 @@ from fluxvla_core.testing.training import run_ranks, tiny_config, train
 from fluxvla_core.training.state import Ema
 from fluxvla_core.training.weights import (
     check_model_tensors,
-    left_out,
+    external_weights,
     load_for_inference,
     load_full_tensors,
     weights_by_name,
@@ -61,7 +61,7 @@ def equal(a, b):
 
 
 def test_only_frozen_weights_with_a_source_are_left_out(tmp_path):
-    found = left_out(Model())
+    found = external_weights(Model())
     assert found.names == {"encoder.words.weight", "encoder.words.bias"}
     assert found.sources == {"encoder": "package:words 1.0"}
     saved = checkpoint(tmp_path, Model(), found).tensors("model.safetensors")
@@ -79,20 +79,20 @@ def test_only_frozen_weights_with_a_source_are_left_out(tmp_path):
 def test_loading_gives_the_model_back(tmp_path):
     model = Model(seed=1)
     other = Model(seed=2)
-    load_for_inference(other, checkpoint(tmp_path, model, left_out(model)))
+    load_for_inference(other, checkpoint(tmp_path, model, external_weights(model)))
     assert equal(model, other) == set()
 
 
 def test_everything_can_be_saved_too(tmp_path):
     model = Model(seed=1, words=1)
     other = Model(seed=2, words=2)
-    load_for_inference(other, checkpoint(tmp_path, model, type(left_out(model))()))
+    load_for_inference(other, checkpoint(tmp_path, model, type(external_weights(model))()))
     assert equal(model, other) == set()
 
 
 def test_frozen_weights_of_another_version_are_refused(tmp_path):
     model = Model(words=1)
-    saved = checkpoint(tmp_path, model, left_out(model))
+    saved = checkpoint(tmp_path, model, external_weights(model))
     with pytest.raises(CheckpointError) as caught:
         load_for_inference(Model(words=2), saved)
     assert str(caught.value) == (
@@ -104,14 +104,14 @@ def test_frozen_weights_of_another_version_are_refused(tmp_path):
 
 
 def test_weights_of_another_model_are_refused():
-    """T3 of the field notes: a wrong checkpoint resumed silently."""
+    """T3 of upstream's bugs: a wrong checkpoint resumed silently."""
     model = Model()
     tensors = {**weights_by_name(model), "head.weight": torch.zeros(9, 4)}
     del tensors["scale"]
     with pytest.raises(
         CheckpointError, match=r"1 missing in the checkpoint: scale\n.*head\.weight"
     ):
-        check_model_tensors(model, tensors, left_out(model), {}, "here")
+        check_model_tensors(model, tensors, external_weights(model), {}, "here")
 
 
 def test_state_that_is_no_tensor_is_refused():
@@ -141,7 +141,7 @@ def test_averages_follow_the_weights_and_act_in_their_place(tmp_path):
             p.add_(1.0)
     ema.update(100)  # decay 0.5
     assert torch.allclose(ema.shadow["head.bias"], before["head.bias"] + (9 / 11 + 2) / 2)
-    saved = checkpoint(tmp_path, model, left_out(model), ema)
+    saved = checkpoint(tmp_path, model, external_weights(model), ema)
     acting = Model(seed=2)
     load_for_inference(acting, saved)
     assert torch.equal(acting.head.bias, ema.shadow["head.bias"])
@@ -159,7 +159,7 @@ def test_averages_of_another_model_are_refused():
 
 def test_loading_leaves_the_checkpoint_as_it_is(tmp_path):
     model = Model()
-    saved = checkpoint(tmp_path, model, left_out(model))
+    saved = checkpoint(tmp_path, model, external_weights(model))
     load_full_tensors(model, saved.tensors("model.safetensors"))
     with torch.no_grad():
         for tensor in model.state_dict().values():
@@ -168,7 +168,7 @@ def test_loading_leaves_the_checkpoint_as_it_is(tmp_path):
 
 
 def test_aliases_header_is_plain_json(tmp_path):
-    saved = checkpoint(tmp_path, Model(), left_out(Model()))
+    saved = checkpoint(tmp_path, Model(), external_weights(Model()))
     data = (saved.path / "model.safetensors").read_bytes()
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     assert header["__metadata__"] == {"format": "pt", "aliases": "{}"}
@@ -193,7 +193,7 @@ def test_averages_of_tied_weights_act_under_both_names(tmp_path):
         model.embed.weight.add_(1.0)
     ema.update(1)
     acts = Tied(seed=1)
-    load_for_inference(acts, checkpoint(tmp_path, model, left_out(model), ema))
+    load_for_inference(acts, checkpoint(tmp_path, model, external_weights(model), ema))
     assert acts.head.weight is acts.embed.weight
     assert torch.equal(acts.head.weight, ema.shadow["embed.weight"])
     assert not torch.equal(acts.head.weight, model.head.weight)

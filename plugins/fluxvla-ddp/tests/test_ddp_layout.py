@@ -7,7 +7,13 @@ import torch
 from fluxvla_core import build_runner_from_cfg, build_vla_from_cfg
 from fluxvla_core.build import RunContext
 from fluxvla_core.testing.training import TinyDataset, run_ranks, tiny_config
-from fluxvla_core.training.cost import fake, kept, kept_by_fake, optimizer_bytes, state_bytes
+from fluxvla_core.training.cost import (
+    fake,
+    fake_activations,
+    optimizer_bytes,
+    saved_activations,
+    state_bytes,
+)
 from fluxvla_core.training.model import ForwardArguments
 
 
@@ -36,8 +42,8 @@ def held(work_dir):
     state = state_bytes(runner.optimizer)
     assert optimizer_bytes(runner.optimizer_settings.build, said.optimized) == state
 
-    counted = kept_by_fake(fake(bare), batch, None)
-    assert counted == kept(runner.model, batch, None)
+    counted = fake_activations(fake(bare), batch, None)
+    assert counted == saved_activations(runner.model, batch, None)
     torch.distributed.destroy_process_group()
 
 

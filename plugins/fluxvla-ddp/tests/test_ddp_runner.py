@@ -23,7 +23,7 @@ from fluxvla_core.testing.training import (
 
 
 class TestDDPTrainRunner(TrainRunnerConformance):
-    """T1 of the field notes: resuming never restored the weights."""
+    """T1 of upstream's bugs: resuming never restored the weights."""
 
     entry_point = "DDPTrainRunner"
 

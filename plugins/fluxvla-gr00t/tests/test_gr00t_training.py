@@ -15,7 +15,7 @@ from fluxvla_core.testing.training import (
     tiny_config,
     train,
 )
-from fluxvla_core.training.cost import fake, kept, kept_by_fake
+from fluxvla_core.training.cost import fake, fake_activations, saved_activations
 from tests.oracles import fill
 
 from .gr00t_sizes import PLACE, TINY_N15, TINY_N17
@@ -161,7 +161,10 @@ def test_a_dry_run_counts_what_its_training_keeps(version, frozen, dtype):
         bare = made()
     samples = [Samples(version).get_sample(i, 0) for i in range(3)]
     batch = {k: torch.from_numpy(np.stack([sample[k] for sample in samples])) for k in KEYS}
-    estimate, found = kept_by_fake(fake(bare), batch, dtype), kept(made(), batch, dtype)
+    estimate, found = (
+        fake_activations(fake(bare), batch, dtype),
+        saved_activations(made(), batch, dtype),
+    )
     assert found.activations > 0
     assert estimate.activations == pytest.approx(found.activations, rel=0.01)
     assert estimate.recomputed == pytest.approx(found.recomputed, rel=0.01)

@@ -272,7 +272,7 @@ def test_inference_shows_one_task_and_reports_success(tmp_path, libero, listener
     assert {line["phase"] for line in commands} == {"run"}
     assert (lines[0]["event"], lines[-1]["event"]) == ("start", "end")
     recorded = open_recording(folder)
-    assert recorded.whole
+    assert recorded.finished
     assert recorded.embodiment.name == summary["embodiment"]
     assert f"success after {summary['steps']} steps" in listener.lines
     shown = images[0].read()

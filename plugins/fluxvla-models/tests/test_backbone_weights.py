@@ -11,7 +11,7 @@ from fluxvla_models.act import ACT
 from fluxvla_models.diffusion_policy import DiffusionPolicy
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.training.weights import put_parts
+from fluxvla_core.training.weights import load_part_weights
 from tests.oracles import fill
 
 KEYS = json.loads((Path(__file__).parent / "keys" / "lerobot_act.json").read_text())
@@ -40,7 +40,7 @@ def test_act_starts_from_them(published) -> None:
     file, tensors = published
     model = ACT(dim_model=32, n_heads=4, dim_feedforward=8, backbone_weights=str(file))
     head = model.action_head.weight.detach().clone()
-    put_parts(model, model.part_weights)
+    load_part_weights(model, model.part_weights)
     state = model.backbone.state_dict()
     assert len(state) == 100
     assert all(torch.equal(tensor, tensors[name]) for name, tensor in state.items())
@@ -57,7 +57,7 @@ def test_every_encoder_of_a_diffusion_policy_starts_from_them(published) -> None
         backbone_norm="batch",
         backbone_weights=str(file),
     )
-    put_parts(model, model.part_weights)
+    load_part_weights(model, model.part_weights)
     for encoder in model.rgb_encoders:
         state = encoder.backbone.state_dict()
         assert len(state) == 120
@@ -71,11 +71,11 @@ def test_other_networks_are_refused(published, tmp_path: Path) -> None:
     small = {"dim_model": 32, "n_heads": 4, "dim_feedforward": 8}
     deep = ACT(**small, backbone="resnet34", backbone_weights=str(file))
     with pytest.raises(CheckpointError, match=r"80 missing: layer1\.2\.bn1\.bias"):
-        put_parts(deep, deep.part_weights)
+        load_part_weights(deep, deep.part_weights)
     thin = ACT(**small, backbone_width=16, backbone_weights=str(file))
     with pytest.raises(CheckpointError, match=r"100 of another size: bn1\.bias: \(64,\) there"):
-        put_parts(thin, thin.part_weights)
+        load_part_weights(thin, thin.part_weights)
     torch.save({**tensors, "aux.weight": torch.zeros(1)}, tmp_path / "more.pth")
     more = ACT(**small, backbone_weights=str(tmp_path / "more.pth"))
     with pytest.raises(CheckpointError, match=r"1 left over: aux\.weight"):
-        put_parts(more, more.part_weights)
+        load_part_weights(more, more.part_weights)

@@ -77,9 +77,9 @@ def test_it_acts_as_there_from_images_and_joints_to_commands(tmp_path, source, w
 
 
 def _question(seen):
-    from fluxvla_core.policies.local import Question
+    from fluxvla_core.policies.local import Query
 
-    return Question(seen, tiny.SEED, 0)
+    return Query(seen, tiny.SEED, 0)
 
 
 def test_what_the_model_gets_is_what_it_gets_there(source, words, golden):

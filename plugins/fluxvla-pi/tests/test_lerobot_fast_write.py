@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fluxvla_models.lerobot_files import whole
+from fluxvla_models.lerobot_files import full_tensor
 from fluxvla_pi import lerobot_fast_write
 from fluxvla_pi.action_tokens import ActionWords
 from fluxvla_pi.lerobot_fast_format import LeRobotPi0FastFormat
@@ -136,7 +136,7 @@ def test_weights_keep_their_dtype_and_the_config_says_it(tmp_path, source, words
     """As LeRobot in bf16, where normalisations stay in float32."""
     read_ = LeRobotPi0FastFormat().read(source, str(words))
     tensors = {
-        name: whole(t).bfloat16() if narrow and "norm" not in name else whole(t)
+        name: full_tensor(t).bfloat16() if narrow and "norm" not in name else full_tensor(t)
         for name, t in read_.tensors.items()
     }
     (tmp_path / "out").mkdir()

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from fluxvla_pi import lerobot_format
+from fluxvla_pi import lerobot_write
 from fluxvla_pi.lerobot_format import LeRobotPiFormat
 from fluxvla_pi.names import LEROBOT
 from safetensors.torch import load_file, save_file
@@ -120,8 +120,8 @@ def test_it_goes_back_as_it_came(tmp_path, bring, monkeypatch, family):
     out = bring(source)
     model = LeRobotPiFormat().read(source).model
     sizes = {key: model[key] for key in ("variant", "expert_variant", "vision_variant")}
-    monkeypatch.setattr(lerobot_format, "_VARIANTS", sizes)
-    monkeypatch.setattr(lerobot_format, "VOCABULARY", pi_inputs.VOCABULARY)
+    monkeypatch.setattr(lerobot_write, "_VARIANTS", sizes)
+    monkeypatch.setattr(lerobot_write, "VOCABULARY", pi_inputs.VOCABULARY)
     assert main(["export", str(out), str(tmp_path / "back"), "--format", "lerobot"]) == 0
 
     ours, theirs = load_file(tmp_path / "back" / "model.safetensors"), weights(family, LEROBOT)
@@ -206,8 +206,8 @@ def test_a_base_model_without_statistics_drives_nothing(tmp_path, bring, monkeyp
         load_policy(out)
     assert no.value.where == str(out)
     sizes = {key: read.model[key] for key in ("variant", "expert_variant", "vision_variant")}
-    monkeypatch.setattr(lerobot_format, "_VARIANTS", sizes)
-    monkeypatch.setattr(lerobot_format, "VOCABULARY", pi_inputs.VOCABULARY)
+    monkeypatch.setattr(lerobot_write, "_VARIANTS", sizes)
+    monkeypatch.setattr(lerobot_write, "VOCABULARY", pi_inputs.VOCABULARY)
     with pytest.raises(CheckpointError, match="has no statistics of proprio, action"):
         export_foreign(out, tmp_path / "back", "lerobot")
 

@@ -9,7 +9,7 @@ from fluxvla_pi.pi0 import PI0FlowMatching
 from fluxvla_pi.pi05 import PI05FlowMatching
 
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.training.cost import fake, kept, kept_by_fake
+from fluxvla_core.training.cost import fake, fake_activations, saved_activations
 
 from .oracles.pi_inputs import ACTIONS, BATCH, HORIZON, SIZES
 from .tiny import acting_batch, model_of, relative, training_batch
@@ -364,8 +364,8 @@ def test_its_activations_are_counted_without_memory(family, dtype):
     with torch.device("meta"):
         bare = model_of(family)
     batch = training_batch()
-    told = kept_by_fake(fake(bare), batch, dtype)
-    found = kept(model_of(family), batch, dtype)
+    told = fake_activations(fake(bare), batch, dtype)
+    found = saved_activations(model_of(family), batch, dtype)
     assert told.activations == pytest.approx(found.activations, rel=0.01)
     assert told.recomputed == pytest.approx(found.recomputed, rel=0.01)
     assert told.weight_copies == found.weight_copies

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from fluxvla_pi import lerobot_format
+from fluxvla_pi import lerobot_write
 from fluxvla_pi.lerobot_format import LeRobotPiFormat
 
 from fluxvla_core.cli.main import main
@@ -35,8 +35,8 @@ def test_a_published_checkpoint_comes_in_and_goes_out(tmp_path, monkeypatch):
 
     model = LeRobotPiFormat().read(source).model
     sizes = {key: model[key] for key in ("variant", "expert_variant", "vision_variant")}
-    monkeypatch.setattr(lerobot_format, "_VARIANTS", sizes)
-    monkeypatch.setattr(lerobot_format, "VOCABULARY", pi_inputs.VOCABULARY)
+    monkeypatch.setattr(lerobot_write, "_VARIANTS", sizes)
+    monkeypatch.setattr(lerobot_write, "VOCABULARY", pi_inputs.VOCABULARY)
     words = ["pi05" if w == "work_dirs/pi05" else w for w in command("export")]
     assert main(words) == 0
     assert LeRobotPiFormat().recognizes(tmp_path / "exported")

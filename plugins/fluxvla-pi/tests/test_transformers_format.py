@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.training.weights import start_from
+from fluxvla_core.training.weights import load_initial_weights
 
 from .oracles import pi_inputs
 from .published_folders import weights
@@ -67,7 +67,7 @@ def test_a_training_starts_from_it(saved):
     read = TransformersPi0Format().read(source)
     assert (read.horizon, read.model["num_steps"]) == (pi_inputs.HORIZON, 10)
     ours = PI0FlowMatching(**{k: v for k, v in read.model.items() if k != "type"})
-    start_from(ours, source)
+    load_initial_weights(ours, source)
     expert = model.state_dict()["model.dit.layers.1.mlp.up_proj.weight"]
     assert torch.equal(ours.state_dict()["llm_expert.layers.1.mlp.up_proj.weight"], expert)
 

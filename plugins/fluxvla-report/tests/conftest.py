@@ -134,7 +134,7 @@ def inference(work_dir: Path, commands: int = 200) -> None:
             "robot": "AlohaSimOperator",
             "joints": JOINTS,
             "rate_hz": 50.0,
-            "skipped_beats": 0,
+            "skipped_ticks": 0,
             "clamps": {"left_waist": {"velocity": 3}},
             "trips": [],
             "timings": {"policy": {**timing, "count": 40, "p50_ms": 11.3}, "late": timing},

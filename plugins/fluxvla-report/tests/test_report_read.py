@@ -48,6 +48,18 @@ def test_a_complete_work_dir(complete: Path) -> None:
     assert facts.dataset["total_episodes"] == 240
 
 
+def test_an_episode_of_version_0_1_is_read_under_its_former_keys(complete: Path) -> None:
+    file = complete / "inference" / "001-lift" / "episode.json"
+    summary = json.loads(file.read_text())
+    del summary["skipped_ticks"]
+    former = {"skipped_beats": 3, "held_beats": 2, "dropped": {"frames": 0, "pictures": 4}}
+    file.write_text(json.dumps({**summary, **former}))
+    (episode,) = read_facts(complete).episodes
+    assert episode.notes["control ticks skipped"] == 3
+    assert episode.notes["control ticks without a chunk, held"] == 2
+    assert episode.notes["not recorded"] == "4 images"
+
+
 def test_what_stopped_the_arm_after_an_episode_is_among_its_notes(complete: Path) -> None:
     (folder,) = (complete / "inference").iterdir()
     trip = {"time": 1.0, "rule": "tracking", "what": "waist is away", "at": 2.0, "failure": None}

@@ -240,7 +240,7 @@ def test_the_runner_of_the_ur5e(tmp_path):
 
 
 def test_without_a_checkpoint_the_message_says_what_to_do(tmp_path):
-    with pytest.raises(CheckpointError, match="there is no whole checkpoint in") as caught:
+    with pytest.raises(CheckpointError, match="there is no undamaged checkpoint in") as caught:
         runner(tmp_path, policy="checkpoint")
     assert "train first" in str(caught.value)
 

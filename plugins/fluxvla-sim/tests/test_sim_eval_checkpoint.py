@@ -93,7 +93,7 @@ def test_a_checkpoint_and_its_untrained_twin_are_evaluated(tmp_path, trembling):
         assert set(results["groups"]) == {"policy", "untrained"}
         assert results["timing"]["policy_ms"] > 0
         assert results["videos"][0]["success"] is False
-        images = results["provenance"]["pictures"]
+        images = results["provenance"]["images"]
         assert images["sizes"] == {"top": [48, 64]}
         (by,) = images["by"]
         assert by.partition(":")[0] in {"egl", "osmesa", "glfw", "the platform's own OpenGL"}

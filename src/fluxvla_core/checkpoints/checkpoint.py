@@ -5,7 +5,7 @@ and a robot that reads an embodiment use the same door as the trainer.
 
     <work_dir>/checkpoints/step-000000100/
         manifest.json            sizes and SHA-256 of everything below
-        model.safetensors        weights and buffers, but for frozen ones that the model brings
+        model.safetensors        weights and buffers, but for frozen ones that the model loads
         ema.safetensors          averaged weights, when they are kept
         adapter/                 what LoRA trains, as peft has it, instead of in the model's file
         optimizer.safetensors    optimizer state by parameter name; where ranks hold parts of it,
@@ -84,7 +84,7 @@ class _Policy:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One whole checkpoint folder; ``open`` it rather than constructing it."""
+    """A complete checkpoint folder; made by ``Checkpoint.open``."""
 
     path: Path
     manifest: Manifest
@@ -269,7 +269,7 @@ def folders(place: str | Path) -> list[Path]:
 
 
 def refuse_existing(work_dir: Path) -> None:
-    """Keep a training that resumes from elsewhere, or from nothing, from another's checkpoints.
+    """Raise an error if the work dir has checkpoints that this training does not continue.
 
     Raises:
         UsageError: there are checkpoints in the work dir, with both ways on.
@@ -286,7 +286,7 @@ def refuse_existing(work_dir: Path) -> None:
 def latest(place: str | Path) -> Checkpoint | None:
     """The newest checkpoint of a work dir, None when there is none yet.
 
-    Only its manifest is read. Loading a policy and ``--resume auto`` use :func:`newest_whole`,
+    Only its manifest is read. Loading a policy and ``--resume auto`` use :func:`newest_undamaged`,
     which verifies every file and passes over a damaged checkpoint.
 
     Raises:
@@ -296,7 +296,7 @@ def latest(place: str | Path) -> Checkpoint | None:
     return Checkpoint.open(found[-1]) if found else None
 
 
-def newest_whole(place: str | Path) -> tuple[Checkpoint | None, list[CheckpointError]]:
+def newest_undamaged(place: str | Path) -> tuple[Checkpoint | None, list[CheckpointError]]:
     """The newest checkpoint that passes :meth:`Checkpoint.verify`, and why newer ones do not."""
     refused: list[CheckpointError] = []
     for folder in reversed(folders(place)):
@@ -354,7 +354,7 @@ def rotate(
 
 
 def name_best(work_dir: Path, step: int) -> bool:
-    """Let ``checkpoints/best`` point to the checkpoint of ``step``; whether that is there.
+    """Link ``checkpoints/best`` to the checkpoint of ``step``; returns whether that exists.
 
     Without it there is no ``best``: an old link would name whatever takes its target's name next.
     """

@@ -58,7 +58,7 @@ def safetensors_in(folder: str | Path, stem: str = "model") -> Mapping[str, Stor
 
 
 def torch_table(file: Path) -> dict[str, Any]:
-    """What a file of ``torch.save`` holds: a table of tensors, or of tables of them.
+    """The content of a file of ``torch.save``: a table of tensors, or of tables of them.
 
     Published weights are pickles in places. They are read as data alone: no object is built.
 

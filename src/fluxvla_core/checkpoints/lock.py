@@ -46,7 +46,7 @@ class WorkDirLock:
         self.close()
 
     def close(self) -> None:
-        """Let others have it; any number of times."""
+        """Release the lock; may be called several times."""
         if self.active:
             os.close(self._place)
         file, self._file, self._outer, self.active = self._file, None, None, False
@@ -54,7 +54,7 @@ class WorkDirLock:
             file.close()
 
     def check(self) -> None:
-        """See that the work dir is still the one that was locked, before anything is written.
+        """Raise an error if the work dir is no longer the one that was locked.
 
         A training that continued would fill a place that somebody cleared, or another one's.
 
@@ -96,7 +96,7 @@ class WorkDirLock:
 
     @property
     def held(self) -> bool:
-        """Whether it is this one that keeps others out."""
+        """Whether this lock is held."""
         return self._file is not None
 
 

@@ -125,7 +125,7 @@ def shard_metadata(tensors: Mapping[str, Tensor]) -> dict[str, str]:
 
 
 class Stored:
-    """One tensor in the files of a checkpoint; indexing reads what is asked for, and no more."""
+    """One tensor in the files of a checkpoint; indexing reads only the selected part."""
 
     def __init__(self, name: str, shape: Sequence[int]) -> None:
         self.name = name
@@ -237,7 +237,7 @@ def open_tensors(path: Path) -> Any:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Let whatever goes wrong with the file in the block be a CheckpointError."""
+    """Context manager: raise errors of reading the file as CheckpointError."""
     from safetensors import SafetensorError
 
     try:

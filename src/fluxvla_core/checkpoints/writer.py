@@ -95,7 +95,7 @@ class CheckpointWriter:
         return None
 
     def set_error(self, error: Exception) -> None:
-        """Let :meth:`commit` fail with ``error``, unless something before it failed."""
+        """Make :meth:`commit` raise ``error``, unless an earlier error is set."""
         if self._error is None:
             described = OSError(f"{type(error).__name__}: {error}")
             self._error = error if isinstance(error, OSError) else described

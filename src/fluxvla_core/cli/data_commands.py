@@ -224,7 +224,7 @@ class Collect:
         add_log_format(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        from fluxvla_core.config.overrides import whole_options
+        from fluxvla_core.config.overrides import complete_hints
         from fluxvla_core.evaluation.collect import Collection
         from fluxvla_core.plugins.registry import load_plugin_files
 
@@ -242,7 +242,7 @@ class Collect:
             failures=args.failures,
         )
         named = {side: tables[table] for side, table in _SIDES.items()}
-        with whole_options(named):
+        with complete_hints(named):
             collect_demonstrations(collection, args)
         return 0
 

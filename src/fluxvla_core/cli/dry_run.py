@@ -12,7 +12,7 @@ from fluxvla_core.cli.plan import Plan
 if TYPE_CHECKING:
     from fluxvla_core.errors import FluxError
     from fluxvla_core.spec import EmbodimentSpec
-    from fluxvla_core.training.rehearsal import Rehearsal
+    from fluxvla_core.training.dry_run import DryRun
 
 _GB = 1e9
 _COLUMNS = 80
@@ -37,10 +37,10 @@ def outline(plan: Plan, log_format: str, nproc: int | None) -> tuple[str, FluxEr
         log_format: ``text`` or ``json``.
         nproc: processes of the training; None for a few numbers of them.
     """
-    rehearsal = _rehearsal(plan, nproc) if plan.trains and "model" in plan.config.tree else None
-    refused = None if rehearsal is None or isinstance(rehearsal, str) else rehearsal.refused
+    result = _dry_run(plan, nproc) if plan.trains and "model" in plan.config.tree else None
+    refused = None if result is None or isinstance(result, str) else result.refused
     if log_format == "json":
-        return json.dumps(_as_json(plan, rehearsal)), refused
+        return json.dumps(_as_json(plan, result)), refused
     lines = [
         f"section: {plan.section} ({'trains' if plan.trains else 'does not train'})",
         f"work dir: {plan.work_dir}",
@@ -49,21 +49,21 @@ def outline(plan: Plan, log_format: str, nproc: int | None) -> tuple[str, FluxEr
         "config:",
         *(f"  {line}" for line in listing(plan.config, origin=True)),
     ]
-    if isinstance(rehearsal, str):
-        lines += ["pipeline:", f"  {rehearsal}"]
-    elif rehearsal is not None:
-        lines += ["pipeline:", *(f"  {line}" for line in _pipeline(rehearsal)), *_memory(rehearsal)]
+    if isinstance(result, str):
+        lines += ["pipeline:", f"  {result}"]
+    elif result is not None:
+        lines += ["pipeline:", *(f"  {line}" for line in _pipeline(result)), *_memory(result)]
     return "\n".join(lines), refused
 
 
-def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
+def _dry_run(plan: Plan, nproc: int | None) -> DryRun | str:
     """The training, built on the meta device; or a line that says why it cannot be."""
     from fluxvla_core.build import RunContext
     from fluxvla_core.cli.reporters import heartbeat
     from fluxvla_core.config.tree import freeze
 
     try:
-        from fluxvla_core.training.rehearsal import PROCESSES, rehearse
+        from fluxvla_core.training.dry_run import PROCESSES, dry_run
     except ImportError as error:
         return f"shapes and memory are not known: {error}"
     context = RunContext(
@@ -75,10 +75,10 @@ def _rehearsal(plan: Plan, nproc: int | None) -> Rehearsal | str:
         nproc=nproc or 1,
     )
     with heartbeat("building the training on the meta device"):
-        return rehearse(context, PROCESSES if nproc is None else (nproc,))
+        return dry_run(context, PROCESSES if nproc is None else (nproc,))
 
 
-def _as_json(plan: Plan, rehearsal: Rehearsal | str | None) -> dict[str, Any]:
+def _as_json(plan: Plan, result: DryRun | str | None) -> dict[str, Any]:
     record: dict[str, Any] = {
         "section": plan.section,
         "trains": plan.trains,
@@ -89,13 +89,13 @@ def _as_json(plan: Plan, rehearsal: Rehearsal | str | None) -> dict[str, Any]:
         "config": plan.config.tree,
         "origins": dict(plan.config.origins),
     }
-    if isinstance(rehearsal, str):
-        return {**record, "notes": [rehearsal]}
-    if rehearsal is None:
+    if isinstance(result, str):
+        return {**record, "notes": [result]}
+    if result is None:
         return record
     from fluxvla_core.training.cost import LEFT_OUT
 
-    data, robot, shape = rehearsal.data, rehearsal.robot, rehearsal.action_shape
+    data, robot, shape = result.data, result.robot, result.action_shape
     dataset = data and {
         "samples": None if data.dataset is None else len(data.dataset),
         "states": data.states,
@@ -104,44 +104,44 @@ def _as_json(plan: Plan, rehearsal: Rehearsal | str | None) -> dict[str, Any]:
     }
     pipeline = {
         "dataset": dataset,
-        "batch": {k: {"shape": list(s), "dtype": d} for k, (s, d) in rehearsal.batch.items()},
+        "batch": {k: {"shape": list(s), "dtype": d} for k, (s, d) in result.batch.items()},
         "model": {
-            "type": rehearsal.model,
-            "parameters": rehearsal.parameters,
-            "trained": rehearsal.trained,
+            "type": result.model,
+            "parameters": result.parameters,
+            "trained": result.trained,
             "action_shape": None if shape is None else list(shape),
         },
         "robot": None if robot is None else robot.to_dict(),
     }
     memory = {
-        "precision": rehearsal.precision,
-        "activations_known": rehearsal.activations_known,
+        "precision": result.precision,
+        "activations_known": result.activations_known,
         "left_out": list(LEFT_OUT),
-        "bytes": {str(count): one.to_dict() for count, one in rehearsal.memory.items()},
+        "bytes": {str(count): one.to_dict() for count, one in result.memory.items()},
     }
-    return {**record, "pipeline": pipeline, "memory": memory, "notes": rehearsal.notes}
+    return {**record, "pipeline": pipeline, "memory": memory, "notes": result.notes}
 
 
-def _pipeline(rehearsal: Rehearsal) -> list[str]:
+def _pipeline(result: DryRun) -> list[str]:
     """Shapes from the data to the robot, a line each."""
     rows: list[tuple[str, str]] = []
-    data = rehearsal.data
+    data = result.data
     if data is not None:
-        rows.append(("dataset", _dataset(rehearsal)))
+        rows.append(("dataset", _dataset(result)))
         cameras = [f"{name} {_size(size)}" for name, size in data.cameras.items()]
         rows.append(("cameras", ", ".join(cameras) or "none"))
         rows.append(("sample", f"states {data.states}, actions {data.actions} wide"))
-    for number, (key, (shape, dtype)) in enumerate(rehearsal.batch.items()):
+    for number, (key, (shape, dtype)) in enumerate(result.batch.items()):
         rows.append(("" if number else "batch", f"{key} {shape} {dtype}"))
-    if rehearsal.model:
-        share = rehearsal.trained / rehearsal.parameters if rehearsal.parameters else 0.0
-        counts = f"{rehearsal.parameters:,} parameters, {rehearsal.trained:,} trained ({share:.1%})"
-        rows.append(("model", f"{rehearsal.model}: {counts}"))
-        if rehearsal.action_shape is not None:
-            rows.append(("", "chunks of {} actions, {} wide".format(*rehearsal.action_shape)))
-    if rehearsal.robot is not None:
-        rows += _robot(rehearsal.robot)
-    rows += [("" if number else "notes", note) for number, note in enumerate(rehearsal.notes)]
+    if result.model:
+        share = result.trained / result.parameters if result.parameters else 0.0
+        counts = f"{result.parameters:,} parameters, {result.trained:,} trained ({share:.1%})"
+        rows.append(("model", f"{result.model}: {counts}"))
+        if result.action_shape is not None:
+            rows.append(("", "chunks of {} actions, {} wide".format(*result.action_shape)))
+    if result.robot is not None:
+        rows += _robot(result.robot)
+    rows += [("" if number else "notes", note) for number, note in enumerate(result.notes)]
     width = max((len(name) for name, _ in rows), default=0)
     return [
         line
@@ -157,7 +157,7 @@ def _pipeline(rehearsal: Rehearsal) -> list[str]:
     ]
 
 
-def _dataset(found: Rehearsal) -> str:
+def _dataset(found: DryRun) -> str:
     assert found.data is not None
     dataset = found.data.dataset
     if dataset is None:
@@ -184,7 +184,7 @@ def _size(size: tuple[int, int] | None) -> str:
     return "of unknown size" if size is None else f"{size[0]}x{size[1]}"
 
 
-def _memory(found: Rehearsal) -> list[str]:
+def _memory(found: DryRun) -> list[str]:
     """The table of memory: a column for each number of processes, at most 80 characters."""
     if not found.memory:
         return []

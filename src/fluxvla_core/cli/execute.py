@@ -93,11 +93,11 @@ def _run_section(
     Returns:
         The runner's result, and the signal that asked to stop it when it was done, or 0.
     """
-    from fluxvla_core.config.overrides import whole_options
+    from fluxvla_core.config.overrides import complete_hints
     from fluxvla_core.contracts.check import is_train_runner
     from fluxvla_core.contracts.runner import Runner
 
-    with whole_options(plan.config.tree, plan.section):
+    with complete_hints(plan.config.tree, plan.section):
         runner = build(context.config[plan.section], context)
         if is_train_runner(type(runner)):
             return _train(plan, runner, context)

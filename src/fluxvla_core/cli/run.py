@@ -105,12 +105,12 @@ class Run:
         after = _plan_evaluation(args, plan) if args.eval_after_train else None
         if args.dry_run:
             from fluxvla_core.cli.dry_run import outline
-            from fluxvla_core.config.overrides import whole_options
+            from fluxvla_core.config.overrides import complete_hints
 
             text, refused = outline(plan, args.log_format, args.nproc)
             say(text)
             if refused is not None:
-                with whole_options(plan.config.tree, plan.section):
+                with complete_hints(plan.config.tree, plan.section):
                     raise refused
             return 0
         if plan.trains:

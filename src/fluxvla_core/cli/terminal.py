@@ -28,7 +28,7 @@ def say(text: str, stream: TextIO | None = None) -> None:
 
 
 def prepare() -> None:
-    """Let stdout and stderr take any text: what a terminal has no letter for becomes an escape.
+    """Make stdout and stderr accept any text: characters that they cannot encode become escapes.
 
     A standard stream that is closed (``fluxvla ... <&-``) becomes the null device: the next file
     that is opened would get its number otherwise, and be another process's stdin.

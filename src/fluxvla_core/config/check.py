@@ -20,6 +20,7 @@ from fluxvla_core.config.resolve import (
     resolve,
 )
 from fluxvla_core.config.signature import Signature, table_of
+from fluxvla_core.config.similar_keys import similar_key, unit_note
 from fluxvla_core.config.tree import Config, all_keys, join_key
 from fluxvla_core.errors import ConfigError, MissingPlugin, PluginError, Problem, nearest
 from fluxvla_core.plugins._metadata import canonical, version
@@ -129,7 +130,7 @@ def _loader_problems(config: Config, section: str) -> list[Problem]:
         found.append(config.problem("train_dataloader", "needs dataset = dict(type=...)"))
     for name in loader.keys() - set(LOADER_KEYS):
         # Another runner may read keys of its own; one that nearly is one of ours is a typo.
-        near = nearest(name, LOADER_KEYS, 0.75)
+        near = similar_key(name, LOADER_KEYS, 0.75)
         if near:
             key = join_key("train_dataloader", name)
             found.append(config.problem(key, f"unknown key; did you mean {near!r}?"))
@@ -268,16 +269,22 @@ class _Walk:
 
     def _unknown(self, key: str, name: str, signature: Signature, table: dict[str, Any]) -> str:
         places = {p.name: p.place for p in signature.parameters if p.name not in INJECTED}
-        near = nearest(name, places)
+        near = similar_key(name, places)
         text = f"{signature.name} takes no {name!r}"
-        if not near:
+        # A train runner's loader has a table of its own.
+        loader = similar_key(name, LOADER_KEYS, 1.0) if "collator" in places else None
+        if not near and loader:
+            text += f"; did you mean train_dataloader.{loader}?"
+        elif not near:
             text += f" (defined at {signature.place})"
         elif near in table:
             # Inherited, more often than not, so that a misspelt key stands next to the right one.
             set_at = self.config.where(join_key(key, near))
             text += f"; did you mean {near!r}? (set at {set_at})"
         else:
-            text += f"; did you mean {near!r}? (defined at {places[near]})"
+            note = unit_note(name, near)
+            text += f"; did you mean {near!r}{f', {note}' if note else ''}?"
+            text += f" (defined at {places[near]})"
         history = self._left_over(key, name)
         return f"{text}; {'or ' if near else ''}{history}" if history else text
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from fluxvla_core.config.resolve import INJECTED, table_signature
+from fluxvla_core.config.similar_keys import similar_key, unit_note
 from fluxvla_core.config.tree import (
     NO_TEXT,
     Config,
@@ -176,14 +177,17 @@ def _check_taken(table: dict[str, Any], above: list[str], name: str, key: str, t
     takes = {n for n in signature.names if n not in INJECTED} if signature is not None else set()
     if name in takes:
         return
-    near = nearest(name, {*takes, *table})
-    hint = _meant(text, join_key(parent_key(key), near)) if near else ""
+    near = similar_key(name, {*takes, *table})
+    hint = _meant(text, join_key(parent_key(key), near), unit_note(name, near)) if near else ""
     if signature is not None and not signature.open:
         missing, adding = f"{missing}, and {signature.name} takes no {name!r}", ""
     raise _BadOverride(missing + hint + adding)
 
 
-def _meant(text: str, key: str) -> str:
+def _meant(text: str, key: str, unit: str = "") -> str:
+    """The key that was meant: with the value given, or with ``unit`` where that is another one."""
+    if unit:
+        return f"; did you mean --set {key}=… ({unit})?"
     return f"; did you mean {_as_set(text, key, '=')}?"
 
 
@@ -204,7 +208,7 @@ _SECTION = "section"
 
 
 @contextmanager
-def whole_options(config: Mapping[str, Any], section: str = "") -> Iterator[None]:
+def complete_hints(config: Mapping[str, Any], section: str = "") -> Iterator[None]:
     """Complete the hint of an error that is raised inside.
 
     Args:

@@ -8,7 +8,7 @@ from typing import Any
 
 from fluxvla_core.config.parameters import Parameter
 from fluxvla_core.config.signature import Signature, read_signature
-from fluxvla_core.config.source import Opaque, flaw, lacks
+from fluxvla_core.config.source import Opaque, lacks, syntax_error
 from fluxvla_core.config.source import find as find_source
 from fluxvla_core.errors import (
     AmbiguousPlugin,
@@ -136,7 +136,7 @@ def installed(plugin: Plugin) -> Found:
                 f"missing (a stale or orphaned install): reinstall {plugin.dist}"
             )
         source = find_source(plugin.module, plugin.attribute)
-        broken = flaw(source.name) if isinstance(source, Opaque) else None
+        broken = syntax_error(source.name) if isinstance(source, Opaque) else None
         if broken:
             raise LoadFailed(
                 f"{plugin.origin} provides {plugin.name!r} but its source has a syntax error: "

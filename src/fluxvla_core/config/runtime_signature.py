@@ -139,7 +139,7 @@ def _class_place(cls: type) -> str:
 
 
 @dataclass(frozen=True)
-class Misfit:
+class TypeMismatch:
     """A key whose value has none of the annotated types of its parameter."""
 
     name: str
@@ -150,7 +150,7 @@ class Misfit:
         return f"{self.name!r} must be {self.expected}, got {self.value!r}"
 
 
-def misfits(cls: type, values: Mapping[str, Any]) -> list[Misfit]:
+def type_mismatches(cls: type, values: Mapping[str, Any]) -> list[TypeMismatch]:
     """The values that do not fit the annotations of the constructor of ``cls`` or of a base."""
     found = []
     hints = _hints(cls)
@@ -159,7 +159,9 @@ def misfits(cls: type, values: Mapping[str, Any]) -> list[Misfit]:
         if hint is not None and not _fits(value, hint):
             expected = hint.__name__ if inspect.isclass(hint) else str(hint)
             found.append(
-                Misfit(name, expected.replace("typing.", "").replace("collections.abc.", ""), value)
+                TypeMismatch(
+                    name, expected.replace("typing.", "").replace("collections.abc.", ""), value
+                )
             )
     return found
 

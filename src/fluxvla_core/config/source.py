@@ -76,7 +76,7 @@ class Opaque:
 Base = Source | Opaque
 
 
-def flaw(dotted: str) -> str | None:
+def syntax_error(dotted: str) -> str | None:
     """``file:line`` and the syntax error of a module in ``dotted``; None if there is none."""
     parts = dotted.split(".")
     for end in range(len(parts), 0, -1):
@@ -107,7 +107,7 @@ def parse(name: str) -> Module | None:
         return None
     tree = _tree(path)
     if tree is None:
-        return None  # ``flaw`` says why
+        return None  # ``syntax_error`` says why
     names: dict[str, ast.AST] = {}
     stars = []
     for node in _top(tree.body):

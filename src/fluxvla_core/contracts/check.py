@@ -218,7 +218,7 @@ def check_policy(policy: Any) -> None:
 
 
 def chunk_problems(action_rate_hz: object, horizon: object) -> list[str]:
-    """Why chunks of so many actions at this rate cannot be played, in words."""
+    """Problems of chunks of so many actions at this rate, in words."""
     problems = []
     rate = action_rate_hz if isinstance(action_rate_hz, SupportsFloat) else math.nan
     if isinstance(action_rate_hz, (bool, str)) or not 0.0 < float(rate) < math.inf:

@@ -72,7 +72,7 @@ class CheckpointFormat(Contract):
           ``without_cameras``.
 
         Args:
-            tokenizer: ``model_path`` of the tokenizer, for formats that bring none.
+            tokenizer: ``model_path`` of the tokenizer, for formats without one.
 
         Raises:
             CheckpointError: it is damaged, of a newer format, or of a model that is not built here.

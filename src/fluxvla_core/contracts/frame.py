@@ -1,4 +1,4 @@
-"""One reading of a robot: its state, its images, and when each arrived."""
+"""Frames (a robot's state and images, with receipt times), observations (a policy's input)."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class Operator(Contract):
 
     @abstractmethod
     def get_frame(self) -> Frame:
-        """The newest reading, in fresh arrays. Raises NotReady before the first one."""
+        """The newest frame, in fresh arrays. Raises NotReady before the first one."""
 
     @abstractmethod
     def send_action(self, action: npt.NDArray[np.float64]) -> None:
@@ -62,7 +62,7 @@ class Operator(Contract):
 
     @abstractmethod
     def stop(self) -> None:
-        """Come to a safe stop and hold: in any state, from any thread, any number of times.
+        """Come to a safe stop and hold: in any state, from any thread; may be called several times.
 
         A later stop, ``close``'s among them, sends the arm nothing unless ``send_action`` succeeded
         since: it may have been moved, and would be thrown back. An arm that somebody else commands
@@ -71,7 +71,7 @@ class Operator(Contract):
 
     @abstractmethod
     def close(self) -> None:
-        """Give everything back; any number of times."""
+        """Close the connection and free all resources; may be called several times."""
 
     # -- optional abilities ----------------------------------------------------------------------
 

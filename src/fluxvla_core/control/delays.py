@@ -102,7 +102,7 @@ class DelayMonitor:
         return source, spent[source]
 
     def stood_still(self, since: float) -> float:
-        """How many seconds since then this process did not run."""
+        """Seconds since then in which this process did not run."""
         now = time.monotonic()
         return sum(_overlap(b, e, since, now) for b, e in self._stalls_until(now))
 

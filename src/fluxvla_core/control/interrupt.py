@@ -32,12 +32,12 @@ class Interrupted(BaseException):
             failure: what went wrong with the robot's stop; None if it was stopped.
         """
         if self.number == signal.SIGINT:
-            return KeyboardInterrupt(f"stopped by Ctrl-C; {what_became(failure)}")
-        return RunFailed(f"stopped by {self.name}; {what_became(failure)}", reason="stopped")
+            return KeyboardInterrupt(f"stopped by Ctrl-C; {stop_outcome(failure)}")
+        return RunFailed(f"stopped by {self.name}; {stop_outcome(failure)}", reason="stopped")
 
 
-def what_became(failure: str | None) -> str:
-    """What became of the robot, for a message; ``failure`` is of its stop, None if it stopped."""
+def stop_outcome(failure: str | None) -> str:
+    """Outcome of a robot's stop, for a message; ``failure``: what went wrong with it, or None."""
     return "the robot was stopped" if failure is None else f"stopping the robot failed: {failure}"
 
 

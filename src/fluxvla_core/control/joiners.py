@@ -223,7 +223,7 @@ class Overlap(StreamedJoiner):
 
 
 def soft_mask(horizon: int, frozen: int, known: int, schedule: str = "exp") -> Array:
-    """How much each action of a new chunk has to agree with the old one: ``W``.
+    """Weights ``W`` of how closely each action of a new chunk has to match the old one.
 
     With ``d`` frozen actions and ``k`` that the old chunk reaches (the paper's ``H - s``),
     ``c_i = (k - i) / (k - d + 1)`` (the paper's equation 5):

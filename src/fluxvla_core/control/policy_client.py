@@ -1,4 +1,4 @@
-"""``PolicyClient``: how the control loop asks a policy, in this process or in another."""
+"""``PolicyClient``: queries a policy for the control loop, in this process or in another."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ class Answer:
 
 
 class PolicyClient(ABC):
-    """Observes the robot and asks the policy, for one episode.
+    """Observes the robot and queries the policy, for one episode.
 
     ``first_state`` and ``reset`` may take long and are called while nothing moves; the others
     return at once, ``slowest_since`` after a tenth of a second. Calls come from one thread at a
-    time, but for ``ask``, which a control process has called from a thread of its own.
+    time, but for ``query``, which a control process has called from a thread of its own.
 
     Where another process observes and thinks, ``meanwhile`` is called again and again while
     ``first_state`` or ``reset`` waits for it, if it is set: an arm that is held hears commands.
@@ -89,8 +89,8 @@ class PolicyClient(ABC):
         """
 
     @abstractmethod
-    def ask(self, previous: PreviousChunk | None) -> Future[Answer]:
-        """Observe, and ask the policy.
+    def query(self, previous: PreviousChunk | None) -> Future[Answer]:
+        """Observe, and query the policy.
 
         Args:
             previous: the chunk that the policy has to continue; None for none.

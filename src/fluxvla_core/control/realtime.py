@@ -47,7 +47,7 @@ def hold_gil() -> None:
 
 
 def share_gil() -> None:
-    """Let other threads have the GIL, for short slices; only within ``real_time``."""
+    """Share the GIL with other threads, for short slices; only within ``real_time``."""
     if _entered:
         sys.setswitchinterval(GIL_SHARED_S)
 
@@ -136,7 +136,7 @@ def real_time() -> Iterator[bool]:
 
 
 def lock_memory() -> bool:
-    """Keep the process's memory from being moved to disk, for good; whether it may.
+    """Lock the process's memory in RAM (``mlockall``); returns whether it is permitted.
 
     Pages are locked once they are in use: a thread's stack is mostly never used.
     """
@@ -154,7 +154,7 @@ def lock_memory() -> bool:
 
 
 def raise_priority() -> bool:
-    """Give the calling thread the priority just below ``real_time``'s, for good; whether it may.
+    """Raise the calling thread's priority to just below ``real_time``'s; whether it is permitted.
 
     For a thread that never computes for long, such as one that only stores what arrives.
     """

@@ -18,9 +18,10 @@ class SafetySettings:
     Args:
         velocity_scale, acceleration_scale: share of the embodiment's limits to use, in (0, 1].
         ramp_scale: share of the velocity limit on the way to the start pose, in (0, 1].
-        max_age_s: how old the newest reading of any stream may be when a policy is asked. How long
-            a stream may be silent between two queries is for the operator to say.
-        max_skew_s: how far the streams of one observation may be apart in time.
+        max_age_s: how old the oldest stream of an observation may be when the policy is queried.
+            Not the operator's ``max_age_s``: how long a stream may be silent, at every command.
+        max_skew_s: how far the receipt times of an observation's streams may be apart. Not the
+            operator's ``max_skew_s``: how far the header stamps of a frame's messages may be apart.
         tracking_error: how far a joint may stay behind its command, in rad (prismatic joints:
             in m, a tenth of it). Grippers are exempt: holding something is their purpose.
         tracking_time_s: for how long.
@@ -123,7 +124,7 @@ class BadCommand(RuleStop):
 
 
 class BadFrame(RuleStop):
-    """A reading is not what the embodiment describes."""
+    """A frame is not what the embodiment describes."""
 
     rule = Rule.FRAME
 
@@ -171,7 +172,7 @@ def rule_of(error: BaseException, otherwise: Rule = Rule.RUN) -> str:
 
 @dataclass(frozen=True)
 class Trip:
-    """Why a motion ended: which rule, what it saw, and when (seconds on the loop's clock)."""
+    """The cause of a stop: which rule, what it saw, and when (seconds on the loop's clock)."""
 
     rule: str
     what: str

@@ -18,10 +18,10 @@ from fluxvla_core.data import lerobot
 from fluxvla_core.data.columns import read_columns
 from fluxvla_core.data.files import (
     arrow,
-    built_aside,
     check_absent,
     parquet,
     read_table,
+    staging_folder,
     write_metadata,
 )
 from fluxvla_core.data.metadata import Metadata, read_metadata
@@ -295,7 +295,7 @@ def merge_datasets(roots: Sequence[str | Path], out: str | Path) -> Path:
         _check_same_settings(settings, metas[0], meta)
     episodes = _sorted([episode for meta in metas for episode in _episodes_of(meta)])
     safe = "the datasets that were to be merged are as they were"
-    with built_aside(target, safe, "make room and merge again") as staging:
+    with staging_folder(target, safe, "make room and merge again") as staging:
         assemble(episodes, staging, settings)
     return target
 

@@ -26,7 +26,7 @@ from fluxvla_core.data.assemble import (
     write_videos,
 )
 from fluxvla_core.data.columns import has_width, read_columns
-from fluxvla_core.data.files import arrow, built_aside, parquet, read_table, write_metadata
+from fluxvla_core.data.files import arrow, parquet, read_table, staging_folder, write_metadata
 from fluxvla_core.data.metadata import Metadata, read_metadata
 from fluxvla_core.data.statistics import LEVELS, image_histogram
 from fluxvla_core.data.video_decode import ImageColumn, Source, read_frames
@@ -52,7 +52,7 @@ def convert(root: str | Path, out: str | Path, reporter: Reporter | None = None)
     if meta.version == lerobot.VERSION:
         raise DataError(f"{source}: is of version {lerobot.VERSION} already")
     checked = read_columns(meta, meta.vectors)
-    with built_aside(target, f"{source} is as it was", "make room and convert again") as staging:
+    with staging_folder(target, f"{source} is as it was", "make room and convert again") as staging:
         _write(meta, checked["task_index"], staging, reporter)
         made = read_metadata(staging)
         read_columns(made, made.vectors)

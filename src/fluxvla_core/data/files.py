@@ -196,7 +196,7 @@ def make_staging(staging: Path) -> None:
 
 
 @contextmanager
-def built_aside(target: Path, safe: str, next: str) -> Iterator[Path]:
+def staging_folder(target: Path, safe: str, next: str) -> Iterator[Path]:
     """A staging folder to write the dataset ``target`` into; published if nothing is raised.
 
     Args:

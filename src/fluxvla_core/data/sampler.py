@@ -39,7 +39,7 @@ _SAMPLE, _ORDER, _MIXTURE, _BATCH = 1, 2, 3, 4
 
 @dataclass(frozen=True, slots=True)
 class SampleKey:
-    """One sample of one epoch: what a data worker is asked for."""
+    """One sample of one epoch, as a data worker is given it."""
 
     epoch: int
     index: int

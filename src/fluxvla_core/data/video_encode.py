@@ -233,7 +233,7 @@ def _packets(clip: Clip, step: Fraction) -> Iterator[tuple[Any, int]]:
 
 @contextlib.contextmanager
 def unchanged_scheduling() -> Iterator[None]:
-    """Keep a library from raising thread priorities: restores them, new threads get the caller's.
+    """Context manager: restore thread priorities that a library raises inside.
 
     SVT-AV1, where it may (as root, which containers on robots often are), makes the thread that
     opens an encoder and all of its own real-time ones of the highest priority, and processes

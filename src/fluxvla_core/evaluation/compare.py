@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import UsageError
-from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, read_log, whole_lines
+from fluxvla_core.evaluation.episodes import DONE, FORMAT, FORMER, complete_lines, read_log
 from fluxvla_core.evaluation.results_file import all_of, flat
 from fluxvla_core.evaluation.success_rates import mcnemar_test, rate, verdict
 
@@ -47,7 +47,7 @@ def read(place: str | Path, group: str = "policy") -> Evaluated:
     found: list[dict[str, Any]] = []
     about: dict[str, Any] | None = None
     for path in _logs(folder):
-        records = whole_lines(read_log(path))
+        records = complete_lines(read_log(path))
         if not records or records[0].get("format") not in (FORMAT, FORMER):
             continue
         stated = records[0].get("evaluation")
@@ -66,7 +66,7 @@ def read(place: str | Path, group: str = "policy") -> Evaluated:
         raise UsageError(
             f"the evaluation in {folder} is of another checkpoint",
             where=str(checkpoint),
-            next="evaluate this one: --set eval.ckpt_path=… --work-dir OTHER",
+            next="evaluate this one: --set <section>.ckpt_path=… --work-dir OTHER",
         )
     done = [r for r in found if r.get("status") == DONE and r["group"] == group]
     if not done:

@@ -36,6 +36,8 @@ POLICY, SWAPPED, UNTRAINED = "policy", "swapped", "untrained"
 FORMAT = "fluxvla-episodes-2"
 FORMER = "fluxvla-episodes-1"
 """Without the code."""
+_FORMER_KEYS = {"skipped_beats": "skipped_ticks", "pictures": "images"}
+"""Keys of records of version 0.1, under which they are still read."""
 LARGEST_LOG = 1 << 30
 """Bytes of an evaluation log, of some 500 an episode."""
 
@@ -232,7 +234,7 @@ class EvalLog:
         for path in sorted(self.path.parent.glob(self._other_logs)) if self._other_logs else []:
             if path == self.path:
                 continue
-            records = whole_lines(read_log(path))
+            records = complete_lines(read_log(path))
             if records and self._is_mine(records[0]):
                 self._take(records, path)
 
@@ -240,7 +242,7 @@ class EvalLog:
         data = read_log(self.path)
         # A crash can leave the last line cut short; it was never reported as finished.
         whole = data[: data.rfind(b"\n") + 1]
-        records = whole_lines(whole)
+        records = complete_lines(whole)
         if not records or not self._is_mine(records[0]):
             self._move_aside(data)
             return
@@ -278,7 +280,7 @@ class EvalLog:
                 where=str(path),
                 cause="a library, a plugin or FluxVLA itself was changed since",
                 next="another --work-dir, or delete the file, to run all of them again; "
-                "--set eval.reuse=true to count them together with the new ones",
+                "--set <section>.reuse=true to count them together with the new ones",
             )
         return code
 
@@ -335,7 +337,7 @@ def read_log(path: Path) -> bytes:
     return read_bytes(path, UsageError, at_most=LARGEST_LOG)
 
 
-def whole_lines(data: bytes) -> list[dict[str, Any]]:
+def complete_lines(data: bytes) -> list[dict[str, Any]]:
     """Headers and episodes of a log; a header, or an empty one, comes first. What is neither is
     left out, as is a last line that was cut short: those episodes were not finished."""
     whole = data[: data.rfind(b"\n") + 1].decode("utf-8", "replace")
@@ -348,7 +350,9 @@ def _parsed(line: str) -> dict[str, Any] | None:
         value = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return value if isinstance(value, dict) and ("format" in value or _is_episode(value)) else None
+    if not isinstance(value, dict) or not ("format" in value or _is_episode(value)):
+        return None
+    return {_FORMER_KEYS.get(str(key), str(key)): entry for key, entry in value.items()}
 
 
 def _is_episode(record: Mapping[str, Any]) -> bool:

@@ -251,7 +251,7 @@ def run_live(
     max_steps: int,
     live: LiveSettings,
 ) -> dict[str, Any]:
-    """One episode on the wall clock.
+    """Run one episode on the wall clock.
 
     Args:
         name: of the folder of its recording.
@@ -259,7 +259,7 @@ def run_live(
     Returns:
         JSON values: ``success``, ``outcome``, ``problem`` (of a safety stop), ``steps`` (commands
         that were sent), ``ticks``, ``missed_ticks`` (those at which the policy had no target),
-        ``skipped_beats`` and ``late_ticks`` (of the machine), ``calls``, ``trips``,
+        ``skipped_ticks`` and ``late_ticks`` (of the machine), ``calls``, ``trips``,
         ``instruction``, ``record`` (the episode's folder) and ``timing``.
 
     Raises:
@@ -272,7 +272,7 @@ def run_live(
         raise ConfigError(
             f"{environment.spec.name} takes no joint targets, so a robot's limits cannot be "
             "applied to its actions; live evaluation always applies them",
-            next="evaluate it stepped: --set eval.live=false",
+            next="evaluate it stepped: --set <section>.live=false",
         )
     folder = Path(live.folder) / name
     shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was cut short
@@ -311,8 +311,8 @@ def run_live(
         "calls": summary["chunks"],
         "ticks": operator.ticks,
         "late_ticks": operator.late,
-        "missed_ticks": summary["held_beats"],
-        "skipped_beats": summary["skipped_beats"],
+        "missed_ticks": summary["held_ticks"],
+        "skipped_ticks": summary["skipped_ticks"],
         "trips": [trip["rule"] for trip in summary["trips"]],
         "instruction": task.instruction,
         "record": str(runner.recorder.folder.relative_to(live.folder)),

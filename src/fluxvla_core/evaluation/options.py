@@ -24,7 +24,7 @@ class EvalOptions:
     """``checkpoint``, ``untrained``, ``expert`` (the environment's own), ``random``, or the table
     of a registered policy."""
     ckpt_path: str | None = None
-    """checkpoint or work dir; the newest whole one of the work dir by default."""
+    """checkpoint or work dir; the newest undamaged one of the work dir by default."""
     dataset: Any = None
     """instead of what the checkpoint says, see ``load_policy``."""
     denormalize_action: Any = None

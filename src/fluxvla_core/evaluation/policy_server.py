@@ -26,7 +26,7 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy, with_history
 from fluxvla_core.errors import EXIT_BAD_INPUT, ConfigError, FluxError, RunFailed
-from fluxvla_core.policies.local import LocalPolicy, Question
+from fluxvla_core.policies.local import LocalPolicy, Query
 from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
@@ -50,13 +50,13 @@ class PolicyFacts:
 class _Request:
     connection: Connection
     name: str
-    question: Question
+    query: Query
 
     @property
     def kind(self) -> tuple[str, bool]:
         """Key of the requests that may share a batch: the policy, and whether they continue a
         chunk."""
-        return self.name, self.question.rest is None
+        return self.name, self.query.rest is None
 
 
 class PolicyServer:
@@ -155,8 +155,8 @@ class PolicyServer:
                     continue
                 assert isinstance(connection, Connection)
                 try:
-                    name, question = connection.recv()
-                    waiting.append(_Request(connection, name, question))
+                    name, query = connection.recv()
+                    waiting.append(_Request(connection, name, query))
                 except (EOFError, OSError):  # the worker is gone
                     connections.remove(connection)
                     connection.close()
@@ -171,7 +171,7 @@ class PolicyServer:
         batch = alike[: policy.batch_size]
         for request in batch:
             waiting.remove(request)
-        answers = self._answers(policy, [request.question for request in batch])
+        answers = self._answers(policy, [request.query for request in batch])
         self.rows += len(batch)
         for request, answer in zip(batch, answers, strict=True):
             try:
@@ -179,19 +179,19 @@ class PolicyServer:
             except OSError:  # the worker is gone; reading its connection will show it
                 continue
 
-    def _answers(self, policy: LocalPolicy, questions: Sequence[Question]) -> list[_Answer]:
-        """The answer to each question.
+    def _answers(self, policy: LocalPolicy, queries: Sequence[Query]) -> list[_Answer]:
+        """The answer to each query.
 
-        If a batch fails each question is answered alone: one that cannot be answered must not end
+        If a batch fails each query is answered alone: one that cannot be answered must not end
         the episodes of the others.
         """
         self.batches += 1
         try:
-            return [("chunk", chunk) for chunk in policy.predict_batch(questions)]
+            return [("chunk", chunk) for chunk in policy.predict_batch(queries)]
         except Exception as error:  # noqa: BLE001 - an episode's crash is counted, not raised
-            if len(questions) == 1:
+            if len(queries) == 1:
                 return [_failure(error)]
-        return [self._answers(policy, [question])[0] for question in questions]
+        return [self._answers(policy, [query])[0] for query in queries]
 
 
 def _failure(error: Exception) -> _Answer:
@@ -234,15 +234,15 @@ class ServedPolicy(Policy):
             FluxError: what means bad input, as the policy raised it.
             RunFailed: the policy raised something else, or the server is gone.
         """
-        return self._ask(Question(observation, self._seed, self._calls))
+        return self._ask(Query(observation, self._seed, self._calls))
 
     def continue_action(self, observation: Observation, rest: Continuation) -> Array:
         """As ``predict_action``, for a chunk that continues ``rest``: see ``Actor``."""
-        return self._ask(Question(observation, self._seed, self._calls, rest))
+        return self._ask(Query(observation, self._seed, self._calls, rest))
 
-    def _ask(self, question: Question) -> Array:
+    def _ask(self, query: Query) -> Array:
         try:
-            self._connection.send((self._name, question))
+            self._connection.send((self._name, query))
             kind, answer = self._connection.recv()
         except (EOFError, OSError) as error:
             raise RunFailed("the process with the policy is gone") from error
@@ -274,11 +274,11 @@ def check_rows(policy: LocalPolicy) -> None:
                 f"batch_size = {most}: on {policy.device} a row's result depends on the others "
                 "in its batch, so episodes could not be repeated",
                 cause="the device sums rows of one batch in different orders",
-                next="--set eval.batch_size=1, or another size",
+                next="--set <section>.batch_size=1, or another size",
             )
 
 
-def _probe(policy: LocalPolicy, share: float) -> Question:
+def _probe(policy: LocalPolicy, share: float) -> Query:
     spec = policy.embodiment
     joints = spec.state_joints or spec.joints
     rng = np.random.default_rng(int(1000 * share))
@@ -291,4 +291,4 @@ def _probe(policy: LocalPolicy, share: float) -> Question:
         },
         "task_description": "do the task",
     }
-    return Question(with_history(observation, policy.n_obs_steps), int(1000 * share), 3)
+    return Query(with_history(observation, policy.n_obs_steps), int(1000 * share), 3)

@@ -234,7 +234,7 @@ class WorkerPool:
                 raise RunFailed(
                     f"worker processes die before they have begun: {why}",
                     cause="out of memory, or a library that crashes while it is loaded",
-                    next="try again with one: --set eval.workers=1",
+                    next="try again with one: --set <section>.workers=1",
                 )
         outcome = None if index is None else self._again(index, why)
         if self._waiting:

@@ -149,7 +149,7 @@ def _collection(root: Path) -> dict[str, Any] | None:
 def rendering(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Rendering of the images of ``records``: ``sizes`` (camera -> height, width), and ``by``
     (GL backend and renderer), which has several entries where machines differ."""
-    images = [record["pictures"] for record in records if record.get("pictures")]
+    images = [record["images"] for record in records if record.get("images")]
     return {
         "sizes": {name: size for each in images for name, size in each["sizes"].items()},
         "by": sorted({each["by"] for each in images if each["by"]}),

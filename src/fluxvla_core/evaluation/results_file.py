@@ -144,7 +144,7 @@ def ticks(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Statistics of the control ticks of live episodes, as JSON values.
 
     ``missed_share``: of all commands, those for which the policy had no target ready;
-    ``skipped_beats`` and ``late_ticks`` are the machine's; ``stopped_by``: rule -> episodes.
+    ``skipped_ticks`` and ``late_ticks`` are the machine's; ``stopped_by``: rule -> episodes.
     """
     done = [r for r in records if r["status"] == DONE]
     commands = sum(r["steps"] for r in done)
@@ -153,7 +153,7 @@ def ticks(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "ticks": sum(r["ticks"] for r in done),
         "missed_ticks": sum(r["missed_ticks"] for r in done),
         "missed_share": sum(r["missed_ticks"] for r in done) / max(commands, 1),
-        "skipped_beats": sum(r["skipped_beats"] or 0 for r in done),
+        "skipped_ticks": sum(r["skipped_ticks"] or 0 for r in done),
         "late_ticks": sum(r["late_ticks"] for r in done),
         "stopped_by": {rule: rules.count(rule) for rule in dict.fromkeys(rules)},
     }
@@ -217,7 +217,7 @@ def report_results(reporter: Reporter, results: Mapping[str, Any], folder: Path)
         stopped = ", ".join(f"{rule} {count}" for rule, count in live["stopped_by"].items())
         reporter.info(
             f"live: {live['missed_share']:.1%} of {live['ticks']} ticks without a target of the "
-            f"policy, {live['skipped_beats']} ticks skipped; stopped by safety: {stopped or 'none'}"
+            f"policy, {live['skipped_ticks']} ticks skipped; stopped by safety: {stopped or 'none'}"
         )
     for video in results["videos"]:
         reporter.artifact("video", folder / video["path"])

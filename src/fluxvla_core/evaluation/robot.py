@@ -263,7 +263,7 @@ def _named(
 
 def _counted(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
     """The values of an episode's summary that an evaluation's record holds."""
-    kept = ("success", "steps", "outcome", "problem", "instruction", "skipped_beats")
+    kept = ("success", "steps", "outcome", "problem", "instruction", "skipped_ticks")
     answers = summary["timings"].get("policy", {"count": 0, "p50_ms": 0.0})
     return {
         **{name: summary.get(name) for name in kept},

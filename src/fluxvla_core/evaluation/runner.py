@@ -231,7 +231,7 @@ class EvalRunner(Runner):
             "behaviours": count_behaviours(records),
             "obeyed": count_obeyed(records),
         }
-        found["provenance"] |= {"unseen_seeds": self._unseen, "pictures": rendering(records)}
+        found["provenance"] |= {"unseen_seeds": self._unseen, "images": rendering(records)}
         if self._live is not None:
             found["live"] = results_file.ticks(records)
         results_file.save_results(self.folder, found, self.context)

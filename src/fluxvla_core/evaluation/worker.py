@@ -149,7 +149,7 @@ class EpisodeWorker:
         record["timing"]["memory_mb"] = memory_mb()
         if cameras:
             sizes = {camera.name: [camera.height, camera.width] for camera in cameras}
-            record["pictures"] = {"sizes": sizes, "by": self.environment.drawn_by()}
+            record["images"] = {"sizes": sizes, "by": self.environment.drawn_by()}
         return record
 
     def actor(self, group: str) -> tuple[Actor, tuple[Camera, ...]]:
@@ -240,7 +240,7 @@ def swapped_task(environment: Environment, task: str, evaluated: Sequence[str]) 
         raise ConfigError(
             f"instruction_swap: no other task of {environment.spec.name} can be done in the scene "
             f"of {task!r}",
-            next="evaluate without it: --set eval.instruction_swap=false",
+            next="evaluate without it: --set <section>.instruction_swap=false",
         )
     here = names.index(task)
     return min(others, key=lambda name: (names.index(name) <= here, names.index(name)))

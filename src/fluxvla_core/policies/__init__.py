@@ -1,1 +1,1 @@
-"""Policies that run in this process: loading one from a checkpoint, and asking it."""
+"""Policies that run in this process: loading one from a checkpoint, and inference."""

@@ -1,4 +1,4 @@
-"""How long a policy takes to answer: ``fluxvla bench-policy``.
+"""Latency of a policy, stage by stage: ``fluxvla bench-policy``.
 
 One observation after another is asked for a chunk, as a robot does. What is measured follows from
 the command line alone (images, states and weights are drawn from ``seed``), so that anybody can
@@ -31,7 +31,7 @@ from fluxvla_core.data.lerobot import camera_name
 from fluxvla_core.data.mixture import first_dataset
 from fluxvla_core.errors import ConfigError, UsageError
 from fluxvla_core.plugins._metadata import version
-from fluxvla_core.policies.local import LocalPolicy, Question
+from fluxvla_core.policies.local import LocalPolicy, Query
 from fluxvla_core.spec import EmbodimentSpec
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def inference_work(policy: LocalPolicy, observation: Observation) -> dict[str, W
     device = torch.device(policy.device)
     batch = {
         key: value.to(device) if isinstance(value, torch.Tensor) else value
-        for key, value in policy.host_batch([Question(observation, 0, 0)]).items()
+        for key, value in policy.host_batch([Query(observation, 0, 0)]).items()
     }
     plain = Eager(policy.model)
     mixed = torch.autocast(device.type, torch.bfloat16, enabled=policy.precision == "bf16")

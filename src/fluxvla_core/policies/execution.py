@@ -1,4 +1,4 @@
-"""How a policy's model computes an answer: ``eager``, ``compiled`` or as a CUDA ``graph``.
+"""Execution of a policy's model: ``eager``, ``compiled`` or as a CUDA ``graph``.
 
 All three give the same actions, up to the rounding of sums in another order. A model that divides
 its answer (``VLA.observe``, ``VLA.denoise``) is timed in two parts, and can be captured: all of its
@@ -52,7 +52,7 @@ Function = Callable[[Tensors], Tensors]
 WARM_UP = 3
 
 
-class Recorded(Protocol):
+class CapturedFunction(Protocol):
     """A function that was recorded with fixed memory."""
 
     @property
@@ -70,7 +70,7 @@ class Recorded(Protocol):
         """
 
 
-Record = Callable[[Function, Tensors], Recorded]
+Record = Callable[[Function, Tensors], CapturedFunction]
 """Records a function with inputs as :func:`static` gives them, or another recording's outputs."""
 
 
@@ -222,7 +222,9 @@ class Graphed(Compiled):
             )
         super().__init__(model)
         self._record = record
-        self._recorded: OrderedDict[Any, tuple[Recorded | None, Recorded]] = OrderedDict()
+        self._recorded: OrderedDict[Any, tuple[CapturedFunction | None, CapturedFunction]] = (
+            OrderedDict()
+        )
 
     def answer(self, batch: Batch, clock: Clock) -> Tensor:
         assert self.parts is not None
@@ -248,7 +250,9 @@ class Graphed(Compiled):
         seen: Tensors = self.model.observe(**observation)
         return seen
 
-    def _new(self, observation: Tensors, noise: Tensor) -> tuple[Recorded | None, Recorded]:
+    def _new(
+        self, observation: Tensors, noise: Tensor
+    ) -> tuple[CapturedFunction | None, CapturedFunction]:
         """Record ``observe``, if the model allows it, and ``denoise``, which reads its memory."""
         tables = self.tables()
 
@@ -279,7 +283,7 @@ class Parts:
         return cls(frozenset(inspect.signature(model.observe).parameters))
 
     def observation(self, batch: Batch) -> dict[str, Any]:
-        """What of ``batch`` belongs to the observation."""
+        """The part of ``batch`` that belongs to the observation."""
         return {name: value for name, value in batch.items() if name in self.names}
 
 

@@ -15,7 +15,7 @@ from fluxvla_core.build import (
     build_transform_from_cfg,
     parameters,
 )
-from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, newest_whole
+from fluxvla_core.checkpoints.checkpoint import Checkpoint, folders, newest_undamaged
 from fluxvla_core.config.load import work_dirs_below
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import InferenceDataset, Transform
@@ -171,7 +171,7 @@ def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
     if ckpt_path is not None and not folders(ckpt_path):
         return Checkpoint.open(ckpt_path).path
     work_dir = work_dir if ckpt_path is None else Path(ckpt_path)
-    found, refused = newest_whole(work_dir)
+    found, refused = newest_undamaged(work_dir)
     if found is not None:
         for error in refused:
             log.warning("not loading a damaged checkpoint: %s: %s", error.where, error.what)
@@ -180,7 +180,7 @@ def find_checkpoint(ckpt_path: str | Path | None, work_dir: Path) -> Path:
     others = [shlex.quote(str(p)) for p in work_dirs_below(Path()) if folders(p)][:3]
     here = f", such as {' or '.join(others)}" if others else ""
     raise CheckpointError(
-        f"there is no whole checkpoint in {work_dir}" + (f": {damaged}" if damaged else ""),
+        f"there is no undamaged checkpoint in {work_dir}" + (f": {damaged}" if damaged else ""),
         next=f"train first (--section runner), or name the work dir of a training{here}: "
         f"--work-dir {others[0] if others else 'DIR'}",
     )

@@ -27,9 +27,9 @@ PRECISIONS = ("float32", "bf16")
 
 
 @dataclass(frozen=True)
-class Question:
-    """One episode's question: what it sees, its seed, how many it asked before, and what the
-    answer has to continue."""
+class Query:
+    """A query of an episode: observation, seed, number of earlier queries, and the rest of the
+    last chunk, which the answer has to continue."""
 
     observation: Observation
     seed: int
@@ -45,7 +45,7 @@ class LocalPolicy(Policy):
     ``inference``, ``postprocess``; ``parts`` those of inference, on the device: ``transfer`` of the
     batch, then ``forward``, or ``prefix`` and ``denoise`` of a model that divides its answer
     (``VLA.observe``). Every forward pass has ``batch_size`` rows (1 unless it is
-    set), however many questions there are: kernels, and so sums, depend on the size.
+    set), however many queries there are: kernels, and so sums, depend on the size.
 
     Args:
         model: ``predict_action(**batch) -> (B, T, D)``, in evaluation mode.
@@ -174,11 +174,11 @@ class LocalPolicy(Policy):
         """
         return self._predict(observation, rest)
 
-    def host_batch(self, questions: Sequence[Question]) -> dict[str, Any]:
-        """What the model is given for ``questions``, in ``batch_size`` rows, still on the host."""
+    def host_batch(self, queries: Sequence[Query]) -> dict[str, Any]:
+        """The model's input for ``queries``, in ``batch_size`` rows, still on the host."""
         import torch
 
-        rows = [self._row(question) for question in questions]
+        rows = [self._row(query) for query in queries]
         rows += rows[:1] * (self.batch_size - len(rows))
         return {
             key: torch.cat([row[key] for row in rows])
@@ -187,8 +187,8 @@ class LocalPolicy(Policy):
             for key, value in rows[0].items()
         }
 
-    def predict_batch(self, questions: Sequence[Question]) -> list[Array]:
-        """An answer to each of at most ``batch_size`` questions, in one forward pass.
+    def predict_batch(self, queries: Sequence[Query]) -> list[Array]:
+        """An answer to each of at most ``batch_size`` queries, in one forward pass.
 
         Either all of them continue a chunk, or none does.
 
@@ -199,10 +199,10 @@ class LocalPolicy(Policy):
 
         from fluxvla_core.policies.execution import clock_of
 
-        if not 1 <= len(questions) <= self.batch_size:
-            raise ValueError(f"{len(questions)} questions, and batch_size is {self.batch_size}")
+        if not 1 <= len(queries) <= self.batch_size:
+            raise ValueError(f"{len(queries)} queries, and batch_size is {self.batch_size}")
         start = time.perf_counter()
-        host = self.host_batch(questions)
+        host = self.host_batch(queries)
         prepared = time.perf_counter()
         transfer, clock = self._transfers(), clock_of(self.device)
         mixed = torch.autocast(
@@ -222,10 +222,10 @@ class LocalPolicy(Policy):
             self._denormalize(
                 {
                     "action": actions[place : place + 1],
-                    "states": np.asarray(question.observation["qpos"]),
+                    "states": np.asarray(query.observation["qpos"]),
                 }
             )[self._past :]
-            for place, question in enumerate(questions)
+            for place, query in enumerate(queries)
         ]
         self.stages = {
             "preprocess": prepared - start,
@@ -243,19 +243,19 @@ class LocalPolicy(Policy):
         return self._transfer
 
     def _predict(self, observation: Observation, rest: Continuation | None = None) -> Array:
-        chunk = self.predict_batch([Question(observation, self._seed, self._calls, rest)])[0]
+        chunk = self.predict_batch([Query(observation, self._seed, self._calls, rest)])[0]
         self._calls += 1
         return chunk
 
-    def _row(self, question: Question) -> dict[str, Any]:
+    def _row(self, query: Query) -> dict[str, Any]:
         """A batch of one, with what the model takes."""
         import torch
 
-        row = self._prepared(question.observation)
+        row = self._prepared(query.observation)
         if "noise" in self._takes:
-            row["noise"] = torch.from_numpy(self._noise(question.seed, question.call))
-        if question.rest is not None:
-            row |= self._rest(question.rest, question.observation)
+            row["noise"] = torch.from_numpy(self._noise(query.seed, query.call))
+        if query.rest is not None:
+            row |= self._rest(query.rest, query.observation)
         if not self._takes_all:
             row = {key: value for key, value in row.items() if key in self._takes}
         return row

@@ -1,4 +1,4 @@
-"""How long an answer takes at least: by operations and by bytes (Williams et al. 2009, "Roofline").
+"""Lower bound of inference time by operations and bytes (Williams et al. 2009, "Roofline").
 
 Matrix products, convolutions and attentions are counted as they are run, on any device, the meta
 device included. A kernel takes as long as its operations at the device's peak, or as its inputs and
@@ -36,7 +36,7 @@ _CPU_ATTENTION = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
 
 @dataclass(frozen=True)
 class Work:
-    """What some kernels do.
+    """Operations and bytes of some kernels.
 
     Args:
         kernels: ``(flops, bytes)`` of each.
@@ -60,7 +60,7 @@ class Work:
 
 
 def work_of(function: Callable[[], Any]) -> tuple[Any, Work]:
-    """What ``function`` gives, and the work of running it."""
+    """The result of ``function``, and the work of running it."""
     counter = _Counter()
     with counter:
         found = function()

@@ -1,6 +1,6 @@
 """An episode's control loop (``ControlLoop``), and its checks at each tick (``Supervisor``).
 
-The loop asks the policy, joins its chunks and plays them, until the episode is over. Only the
+The loop queries the policy, joins its chunks and plays them, until the episode is over. Only the
 thread that calls ``run`` sends commands, on the absolute deadlines of the control rate; the one
 exception is the operator's own ``stop``, which has a thread and a time limit of its own.
 On a robot the policy observes and thinks in a thread of its own, so that a slow, hung or raising
@@ -9,7 +9,7 @@ policy never keeps a command from being sent: without a chunk the arm brakes and
 between commands, observing happens in the sending thread (renderers are bound to one), and answers
 take as long as they are said to: none, or ``latency_s``.
 
-A chunk is played whole before the next is asked for (``Synchronous``), or the policy is asked again
+A chunk is played whole before the next query (``Synchronous``), or the policy is queried again
 while its last answer is being played (the joiners that are ``streamed``).
 """
 
@@ -55,7 +55,7 @@ class PendingQuery:
 
     Args:
         future: the future of the answer.
-        last: ``(D,)`` the last command when it was asked.
+        last: ``(D,)`` the last command at the time of the query.
         due: in lockstep, the time before which the answer does not count as there.
     """
 
@@ -70,7 +70,7 @@ class ControlLoop:
 
     Args:
         robot: the connected robot; its clock counts.
-        client: observes the robot and asks the policy.
+        client: observes the robot and queries the policy.
         joiner: joins the chunks to one motion.
         sender: sends every command; started at the arm's pose.
         supervisor: the episode's supervisor; is notified of every accepted chunk.
@@ -167,7 +167,7 @@ class ControlLoop:
         last = self.sender.limiter.last
         due = self.robot.clock.now() + self.latency_s
         until = time.monotonic() + self.safety.first_chunk_s
-        future = self.client.ask(self.joiner.previous_chunk())
+        future = self.client.query(self.joiner.previous_chunk())
         if self.robot.lockstep and time.monotonic() > until:
             raise self._no_chunk(until)
         return PendingQuery(future, last, due)
@@ -175,7 +175,7 @@ class ControlLoop:
     def _first(self) -> tuple[Answer, Array]:
         """The first answer: nothing moves, and the policy may have to warm up.
 
-        On a robot it is asked again: by the time of a long answer, what it saw is old. If the
+        On a robot it is queried again: by the time of a long answer, what it saw is old. If the
         second one takes long as well, a third shows whether it always does. The episode begins
         with the last.
         """

@@ -63,7 +63,7 @@ Arguments: the task, the seed of the policy, the episode's watch, and what takes
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """How an episode is driven.
+    """Settings of an episode.
 
     Args:
         rate_hz: commands a second.

@@ -49,8 +49,8 @@ class Phase(str, Enum):
 
 
 @dataclass(frozen=True)
-class RobotReading:
-    """One reading of the robot: observation, state and their times (s) on the robot's clock.
+class ObservedFrame:
+    """One observation of the robot, with its frame, state and times (s) on the robot's clock.
 
     Args:
         observation: as the operator gave it, with the instruction.
@@ -58,7 +58,7 @@ class RobotReading:
         state: ``(state_dim,)``.
         measured: when the state arrived.
         at: when the oldest of its streams arrived.
-        seconds: duration of each stage of reading.
+        seconds: duration of each stage of making it.
     """
 
     observation: dict[str, Any]
@@ -94,24 +94,24 @@ class EpisodeStarted(Event):
 
 @dataclass(frozen=True)
 class Observed(Event):
-    """A reading of the robot that passed its checks."""
+    """An observation passed its checks."""
 
-    reading: RobotReading
+    observed: ObservedFrame
 
 
 @dataclass(frozen=True)
-class Remembered(Event):
-    """A reading between two queries, now that a query uses it as history.
+class HistoryObserved(Event):
+    """An observation made between two queries, now that a query uses it as history.
 
     ``at`` is when it was made, which is before other events that came first.
     """
 
-    reading: RobotReading
+    observed: ObservedFrame
 
 
 @dataclass(frozen=True)
 class Refused(Event):
-    """A ``reading`` or a ``chunk`` (``what``) did not pass its checks; any values."""
+    """An ``observation`` or a ``chunk`` (``what``) did not pass its checks; any values."""
 
     what: str
     values: Mapping[str, Any]
@@ -119,9 +119,9 @@ class Refused(Event):
 
 @dataclass(frozen=True)
 class ChunkAccepted(Event):
-    """The policy's answer to a reading: ``(T, D)`` actions, read-only; and seconds by stage."""
+    """The policy's answer to a query: ``(T, D)`` actions, read-only; and seconds by stage."""
 
-    reading: RobotReading
+    observed: ObservedFrame
     actions: Array
     stages: Mapping[str, float]
 
@@ -141,7 +141,7 @@ class CommandSent(Event):
 
 
 @dataclass(frozen=True)
-class FilterLeftOut(Event):
+class FilterSkipped(Event):
     """The action filter called ``name`` was late, and is left out of the command that comes next.
 
     After too many in a row there is none: the arm is stopped."""
@@ -201,9 +201,9 @@ class HookObserver(EpisodeObserver):
         match event:
             case EpisodeStarted(at=at, task=task):
                 self._hooks.call("episode_started", task=task.instruction, stamp=at)
-            case ChunkAccepted(at=at, reading=reading, actions=chunk, stages=stages):
-                shown = _frozen(reading.observation)
-                self._hooks.call("observed", observation=shown, stamp=reading.measured)
+            case ChunkAccepted(at=at, observed=observed, actions=chunk, stages=stages):
+                shown = _frozen(observed.observation)
+                self._hooks.call("observed", observation=shown, stamp=observed.measured)
                 latency = stages["policy"]
                 self._hooks.call("inferred", chunk=chunk, latency_s=latency, stamp=at)
             case CommandSent(at=at, sent=sent, state=state):

@@ -26,7 +26,7 @@ from fluxvla_core.control.joiners import PreviousChunk
 from fluxvla_core.control.policy_client import Answer, PolicyClient, PolicyFailed
 from fluxvla_core.control.safety import BadChunk
 from fluxvla_core.errors import FluxError
-from fluxvla_core.robot.events import ChunkAccepted, Refused, RobotReading
+from fluxvla_core.robot.events import ChunkAccepted, ObservedFrame, Refused
 from fluxvla_core.robot.observations import ObservationHistory, ObservationReader
 
 T = TypeVar("T")
@@ -35,15 +35,15 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PolicyAnswer(Answer):
-    """A policy's answer to a reading, as it came.
+    """A policy's answer to a query, as it came.
 
     Args:
-        reading: that it was asked with.
+        observed_frame: the observation of the query.
         chunk: as it came.
         stages: seconds, by stage; ``policy`` is all of it.
     """
 
-    reading: RobotReading
+    observed_frame: ObservedFrame
     chunk: Any
     stages: Mapping[str, float]
 
@@ -83,10 +83,10 @@ class LocalPolicyClient(PolicyClient):
             ) from error
         self._history.reset()
 
-    def ask(self, previous: PreviousChunk | None) -> Future[Answer]:
+    def query(self, previous: PreviousChunk | None) -> Future[Answer]:
         if self._robot.lockstep:
-            reading, seen = self._history.read()
-            return self._thread.submit(lambda: self._predict(reading, seen, previous))
+            observed, seen = self._history.read()
+            return self._thread.submit(lambda: self._predict(observed, seen, previous))
         return self._thread.submit(lambda: self._predict(*self._history.read(), previous))
 
     def ticked(self) -> None:
@@ -95,13 +95,13 @@ class LocalPolicyClient(PolicyClient):
         if self._robot.lockstep:
             self._history.sample()
         elif self._thread.idle_within(0.0):
-            # What goes wrong is raised by the next question's own reading.
+            # What goes wrong is raised by the next query's own observation.
             self._thread.submit(self._history.sample)
 
     def accepted(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)
         now = self._robot.clock.now()
-        self._emit(ChunkAccepted(now, answer.reading, answer.checked(), answer.stages))
+        self._emit(ChunkAccepted(now, answer.observed_frame, answer.checked(), answer.stages))
 
     def refused(self, answer: Answer) -> None:
         assert isinstance(answer, PolicyAnswer)
@@ -111,11 +111,11 @@ class LocalPolicyClient(PolicyClient):
         return self._robot.delays.longest(since)
 
     def _predict(
-        self, reading: RobotReading, seen: Observation, previous: PreviousChunk | None
+        self, observed: ObservedFrame, seen: Observation, previous: PreviousChunk | None
     ) -> Answer:
-        """The policy's answer to a reading, its chunk checked; in the policy's thread."""
+        """The policy's answer to a query, its chunk checked; in the policy's thread."""
         policy: Any = self._policy
-        rest = None if previous is None else previous.continuation(reading.at, policy.horizon)
+        rest = None if previous is None else previous.continuation(observed.at, policy.horizon)
         began = time.perf_counter()
         try:
             with self._robot.delays.of(POLICY):
@@ -136,8 +136,8 @@ class LocalPolicyClient(PolicyClient):
         try:
             actions = self._checked(chunk)
         except BadChunk as error:
-            return PolicyAnswer(reading.at, None, error, reading, chunk, stages)
-        return PolicyAnswer(reading.at, actions, None, reading, chunk, stages)
+            return PolicyAnswer(observed.at, None, error, observed, chunk, stages)
+        return PolicyAnswer(observed.at, actions, None, observed, chunk, stages)
 
     def _checked(self, chunk: Any) -> Array:
         """``(T, D)`` the actions of a chunk, read-only.

@@ -23,11 +23,11 @@ from fluxvla_core.control.interrupt import Interrupts
 from fluxvla_core.control.safety import BadFrame, BadTiming, SafetySettings
 from fluxvla_core.control.tracking import TrackingWatch
 from fluxvla_core.errors import FluxError, NotReady
-from fluxvla_core.robot.events import Event, Observed, Refused, Remembered, RobotReading
+from fluxvla_core.robot.events import Event, HistoryObserved, Observed, ObservedFrame, Refused
 from fluxvla_core.robot.robot import Observe, Robot, check_frame, is_number
 
-_READ_TIMEOUT_S = 0.5  # the least time that the first reading is given
-_LONG_S = 0.1  # a reading that takes longer makes its own streams old
+_READ_TIMEOUT_S = 0.5  # the least time that the first frame is given
+_LONG_S = 0.1  # a frame that takes longer makes its own streams old
 _AHEAD_S = 0.005  # a stamp may be this far in the future: its age was computed meanwhile
 # Times of a history's observations, in actions.
 _AWAY = 0.6  # half of one, where the robot is read once an action, and what threads add
@@ -37,16 +37,16 @@ _ROUNDING_S = 1e-6  # of sums of a clock's steps
 
 @dataclass(eq=False)
 class ObservationReader:
-    """Reads the robot for the policy, and refuses readings that a policy must not act on.
+    """Reads the robot for the policy; raises an error for what a policy must not act on.
 
     Args:
         robot: the connected robot.
         observe: makes an observation of the robot's newest frame.
         instruction: the task in words.
         cameras: names of the cameras that the policy looks at.
-        safety: how old readings may be, and how far their streams may be apart.
-        ready_s: how long the robot may take to give its first reading.
-        tracking: the episode's watch; compares each reading with the robot's commands.
+        safety: how old observations may be, and how far their streams may be apart.
+        ready_s: how long the robot may take to give its first frame.
+        tracking: the episode's watch; compares each state with the robot's commands.
         submit: runs a function in the thread in which the robot is read: cameras may be bound to
             one.
         interrupts: signals; checked while waiting.
@@ -67,7 +67,7 @@ class ObservationReader:
     def __post_init__(self) -> None:
         self._gate = FreshnessGate(self.safety.max_age_s, self.safety.max_skew_s)
 
-    def first(self) -> RobotReading:
+    def first(self) -> ObservedFrame:
         """The first one, for which the robot has ``ready_s``.
 
         Raises:
@@ -79,38 +79,37 @@ class ObservationReader:
         while True:
             self.interrupts.check()
             try:
-                reading = self._checked(*self._first_frame(until), {})
+                observed = self._checked(*self._first_frame(until), {})
                 break
             except (NotReady, BadTiming) as error:
                 if time.monotonic() > until:
                     raise NotReady(
-                        f"the robot gave no complete reading within {self.ready_s:g} s: "
-                        f"{error.what}",
+                        f"the robot gave no complete frame within {self.ready_s:g} s: {error.what}",
                         cause=error.cause,
                         next=error.next,
                     ) from error
                 time.sleep(0.02)
-        self.emit(Observed(self.robot.clock.now(), reading))
-        return reading
+        self.emit(Observed(self.robot.clock.now(), observed))
+        return observed
 
-    def read(self) -> RobotReading:
-        """One more; in the thread that asks the policy.
+    def read(self) -> ObservedFrame:
+        """The next one; in the thread that queries the policy.
 
         Raises:
             BadFrame: it is not what the embodiment describes, or a stream is gone.
             BadTiming: it is too old, its streams are too far apart, or one ran backwards.
             NotFollowing: the arm is not where it is commanded to be.
         """
-        reading = self.sample()
+        observed = self.sample()
         if self.robot.follows_commands:
-            self.tracking.check(reading.state, reading.measured)
-        self.emit(Observed(self.robot.clock.now(), reading))
-        return reading
+            self.tracking.check(observed.state, observed.measured)
+        self.emit(Observed(self.robot.clock.now(), observed))
+        return observed
 
-    def sample(self) -> RobotReading:
-        """A reading between two queries, for a policy's history; the arm is not checked.
+    def sample(self) -> ObservedFrame:
+        """An observation between two queries, for a policy's history; the arm is not checked.
 
-        The history emits it, if a query needs it (``Remembered``).
+        The history emits it, if a query needs it (``HistoryObserved``).
         """
         began = time.perf_counter()
         observation, frame = self._frame()
@@ -169,7 +168,7 @@ class ObservationReader:
 
     def _checked(
         self, observation: dict[str, Any], frame: Frame | None, seconds: dict[str, float]
-    ) -> RobotReading:
+    ) -> ObservedFrame:
         _check_complete(observation, self.cameras)
         measured = at = now = self.robot.clock.now()
         state, images, stamps = observation["qpos"], observation["images"], dict[str, float]()
@@ -183,11 +182,11 @@ class ObservationReader:
             check_frame(seen, self.robot.embodiment, self.cameras)
         except BadFrame:
             values = {"state": state, "images": images}
-            self.emit(Refused(self.robot.clock.now(), "reading", values))
+            self.emit(Refused(self.robot.clock.now(), "observation", values))
             raise
         state = np.asarray(state, dtype=np.float64)
         asked = {**observation, "task_description": self.instruction}
-        return RobotReading(asked, frame, state, measured, at, seconds)
+        return ObservedFrame(asked, frame, state, measured, at, seconds)
 
 
 def _shown(window: object) -> str:
@@ -220,8 +219,8 @@ class FreshnessGate:
     """Checks receipt age and skew of an observation's streams, and that none runs backwards.
 
     Args:
-        max_age_s: how old the newest reading of any stream may be.
-        max_skew_s: how far the streams may be apart.
+        max_age_s: ``safety.max_age_s``: how old the newest data of any stream may be.
+        max_skew_s: ``safety.max_skew_s``: how far the receipt times may be apart.
     """
 
     def __init__(self, max_age_s: float, max_skew_s: float) -> None:
@@ -260,7 +259,7 @@ class FreshnessGate:
                 raise BadTiming(f"stream {stream} went back in time by {before - stamp:.3f} s")
             if age > self.max_age_s:
                 raise BadTiming(
-                    f"stream {stream} is stale: its newest reading is {age:.2f} s old, "
+                    f"stream {stream} is stale: its newest data is {age:.2f} s old, "
                     f"safety.max_age_s is {self.max_age_s:g}",
                     cause="the camera or the driver froze, or the network lost it",
                 )
@@ -279,16 +278,16 @@ class FreshnessGate:
 
 @dataclass
 class _Kept:
-    """A reading that was begun ``at`` and done at ``made``, and whether it is an event yet."""
+    """An observation that was begun ``at`` and done at ``made``, and whether it is an event yet."""
 
     at: float
     made: float
-    reading: RobotReading
+    observed: ObservedFrame
     emitted: bool
 
     @property
     def observation(self) -> Observation:
-        seen: Observation = {**self.reading.observation}  # type: ignore[typeddict-item]
+        seen: Observation = {**self.observed.observation}  # type: ignore[typeddict-item]
         return seen
 
 
@@ -302,7 +301,7 @@ class ObservationHistory:
 
     An observation of the history is the one that was made nearest to its time, at most 0.6 of an
     action away; in a lockstep simulation whose actions are whole control steps it is that of its
-    time. All methods but ``due`` are called in the reading thread.
+    time. All methods but ``due`` are called in the thread that reads the robot.
 
     Args:
         reader: reads the robot, for a query and between two.
@@ -347,8 +346,8 @@ class ObservationHistory:
         at = self._robot.clock.now()
         self._keep(at, self._reader.sample(), emitted=False)
 
-    def read(self) -> tuple[RobotReading, Observation]:
-        """A reading of the robot, and the policy's input: its observation with the history.
+    def read(self) -> tuple[ObservedFrame, Observation]:
+        """An observation of the robot, and the policy's input: the same with the history.
 
         Raises:
             BadFrame, BadTiming, NotFollowing: as ``ObservationReader.read``; or the robot cannot
@@ -357,19 +356,19 @@ class ObservationHistory:
         began = self._robot.clock.now()
         while True:
             at = self._robot.clock.now()
-            reading = self._reader.read()
-            present: Observation = {**reading.observation}  # type: ignore[typeddict-item]
+            observed = self._reader.read()
+            present: Observation = {**observed.observation}  # type: ignore[typeddict-item]
             if self.steps == 1:
-                return reading, present
+                return observed, present
             before = self._before(at)
-            self._keep(at, reading, emitted=True)
+            self._keep(at, observed, emitted=True)
             if before is not None:
                 for each in before:
                     if not each.emitted:
                         each.emitted = True
-                        self._reader.emit(Remembered(each.made, each.reading))
+                        self._reader.emit(HistoryObserved(each.made, each.observed))
                 seen = [each.observation for each in before]
-                return reading, with_history(present, self.steps, seen)
+                return observed, with_history(present, self.steps, seen)
             now = self._robot.clock.now()
             patience_s = self._reader.safety.max_age_s + self.steps * self._apart
             if self._robot.lockstep or now - began > patience_s:
@@ -381,17 +380,17 @@ class ObservationHistory:
                 )
             self._sleep(max(at + self._apart - now, 0.0))
 
-    def _keep(self, at: float, reading: RobotReading, emitted: bool) -> None:
+    def _keep(self, at: float, observed: ObservedFrame, emitted: bool) -> None:
         if not self._kept:
             self._first = at
-        self._kept.append(_Kept(at, self._robot.clock.now(), reading, emitted))
+        self._kept.append(_Kept(at, self._robot.clock.now(), observed, emitted))
         while self._kept[0].at < at - self.steps * self._apart:
             self._kept.popleft()
         if self._next is None or at + self._apart / 2 > self._next:
             self._next = at + self._apart
 
     def _before(self, at: float) -> list[_Kept] | None:
-        """The readings before ``at``; None where one is missing, fewer where the episode began.
+        """The observations before ``at``; None where one is missing, fewer where the episode began.
 
         The first of an episode is repeated, by ``with_history``.
         """

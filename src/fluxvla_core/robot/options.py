@@ -31,12 +31,12 @@ class InferenceOptions:
     operator that cannot be divided (``Operator.without_cameras``) runs there as a whole, its
     images included."""
     ready_timeout: float = 10.0
-    """seconds that the robot may take to give its first reading."""
+    """seconds that the robot may take to give its first frame."""
 
     policy: Any = None
     """table or object of the Policy contract, instead of a checkpoint."""
     ckpt_path: str | None = None
-    """checkpoint or work dir; the newest whole one of the work dir by default."""
+    """checkpoint or work dir; the newest undamaged one of the work dir by default."""
     dataset: Any = None
     """instead of what the checkpoint says, see ``load_policy``."""
     denormalize_action: Any = None

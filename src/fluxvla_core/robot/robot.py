@@ -253,7 +253,7 @@ class Robot:
         return self._bounded("stop", self._operator.stop) if self.can_stop else None
 
     def close(self) -> str | None:
-        """Give the connection back; None, or what went wrong. Never raises, never hangs."""
+        """Close the connection; returns None, or what went wrong. Never raises, never hangs."""
         return self._bounded("close", self._operator.close) if self._has("close") else None
 
     def _has(self, ability: str) -> bool:
@@ -365,7 +365,7 @@ def as_frame(value: Any, source: str) -> Frame:
     if not all(hasattr(value, field) for field in fields):
         raise BadFrame(
             f"{source} gave a {type(value).__name__}, not a Frame",
-            cause="a Frame has state, images and stamps; where there is no reading yet, "
+            cause="a Frame has state, images and stamps; where there is no frame yet, "
             "get_frame() raises NotReady",
             next="see docs/writing-a-plugin.md for an example",
         )

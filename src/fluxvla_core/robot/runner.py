@@ -251,7 +251,7 @@ class BaseInferenceRunner(Runner):
         return self._layout.tables is not None
 
     def get_ros_observation(self) -> tuple[Any, ...]:
-        """The newest reading: one image for each of ``camera_names``, then the state.
+        """The newest frame: one image for each of ``camera_names``, then the state.
 
         A subclass returns whatever its ``update_observation_window`` makes use of.
         """

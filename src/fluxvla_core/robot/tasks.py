@@ -344,7 +344,7 @@ def task_source(
     domain_id: int | None = None,
     free: bool = False,
 ) -> TaskSource:
-    """What a run's ``--task``, ``--tasks`` and config say, or else the terminal.
+    """The task source that ``--task``, ``--tasks`` or the config name; the terminal by default.
 
     Args:
         context: of the run.

@@ -288,7 +288,7 @@ def _check_domain(domain_id: int | None) -> None:
 
 @functools.cache
 def keep_large_blocks() -> bool:
-    """Let the memory of one image serve the next, in this process; whether the C library can.
+    """Reuse the memory of large messages (``mallopt``); returns whether the C library can.
 
     An image is larger than what malloc keeps: each message, and each copy of one, would be asked
     of the kernel and given back to it, page by page, which takes longer than copying the image

@@ -124,7 +124,7 @@ class Outbox:
         return self._waiting[0][0] if self._waiting else math.inf
 
     def put(self, stream: str, publisher: Any, message: Any, now: float) -> None:
-        """Let ``publisher`` send what the stream's fault leaves of the message."""
+        """Queue the message for ``publisher``, changed by the stream's fault."""
         for delay, changed in self._faults.apply(stream, message):
             heapq.heappush(self._waiting, (now + delay, next(self._ticket), publisher, changed))
 

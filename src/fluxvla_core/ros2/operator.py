@@ -55,8 +55,10 @@ class RosOperator(Operator):
     Args:
         domain_id: the ROS domain; None takes ``ROS_DOMAIN_ID``.
         connect_timeout_s: how long ``connect`` waits for drivers to be there and to send.
-        max_age_s: how long a stream may be silent (``safety.max_age_s``: age of observations).
-        max_skew_s: how far the messages of one frame may be apart by their stamps.
+        max_age_s: how long a stream may be silent, checked at every command. Not
+            ``safety.max_age_s``: how old an observation may be when the policy is queried.
+        max_skew_s: how far the messages of one frame may be apart, by ``sync_on``. Not
+            ``safety.max_skew_s``: how far the receipt times of an observation may be apart.
         sync_on: ``stamp`` compares the senders' clocks, ``receipt`` when messages arrived.
         rate_window_s: for how long ``connect`` counts what arrives; 0 does not count.
     """

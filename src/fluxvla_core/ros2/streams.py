@@ -146,7 +146,7 @@ class Ring:
         self.stepped_at: float | None = None
 
     def add(self, receipt: float, stamp: float | None, message: Any) -> bool:
-        """Keep the message if it is news; returns whether it is."""
+        """Store the message if it is new; returns whether it is."""
         with self._lock:
             self.received += 1
             before, self._before = self._before, (receipt, stamp)

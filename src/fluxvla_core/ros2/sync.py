@@ -120,7 +120,7 @@ def check_together(streams: Streams, max_skew: float, wall_offset: float | None 
             f"{first} is stamped {apart:.3f} s earlier than {last}, although they arrive together; "
             f"at most {max_skew:g} s is allowed",
             cause=_wrong_clock({name: delays[name] for name in (first, last)}, wall_offset),
-            next=f"{_CLOCKS}; max_skew_s sets what is allowed",
+            next=f"{_CLOCKS}; the operator's max_skew_s sets what is allowed",
         )
 
 
@@ -137,7 +137,7 @@ def check_age(matched: Matched, now: float, max_age: float) -> None:
             f"{matched.slowest} is late: what belongs to its newest message arrived {age:.2f} s "
             f"ago; {max_age:g} s is allowed",
             cause="its driver or the network delays it",
-            next="look at its driver's load; if that is how it is, allow more with max_age_s",
+            next="look at its driver's load, or allow more with max_age_s of the operator",
         )
 
 
@@ -189,7 +189,7 @@ def _too_far_apart(
     first, last = min(times, key=times.__getitem__), max(times, key=times.__getitem__)
     receipts = [m.receipt for m in chosen.values()]
     cause = f"{first} is late, or comes in bursts"
-    step = "look at its driver's load, or allow more with max_skew_s"
+    step = "look at its driver's load, or allow more with max_skew_s of the operator"
     if by == "stamp" and skew > 10 * max(max(receipts) - min(receipts), max_skew):
         cause = "they arrive together, so the clocks that stamp them differ"
         step = _CLOCKS

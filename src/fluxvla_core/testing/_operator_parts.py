@@ -56,7 +56,7 @@ class DividedOperatorChecks:
                 Operator.adapt(part).close()
 
     def frame(self, operator: Any) -> Frame:
-        """One reading.
+        """One frame.
 
         Override it for an operator of the specification's shape, whose ``get_frame`` gives what its
         own runner understands: make a ``Frame`` of that, and raise NotReady where there is none.

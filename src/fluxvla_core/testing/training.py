@@ -238,7 +238,7 @@ class Notes(SilentReporter):
 
 
 def train(settings: Mapping[str, Any]) -> Any:
-    """One training run in this process; gives the runner.
+    """Run a training in this process; returns its runner.
 
     Args:
         settings: ``work_dir`` and ``config``; ``resume`` (None); ``dataset``, or the ``length``

@@ -34,8 +34,11 @@ if TYPE_CHECKING:
     from fluxvla_core.training.model import units_of as units_of
     from fluxvla_core.training.state import rng_state as rng_state
     from fluxvla_core.training.state import set_rng_state as set_rng_state
-    from fluxvla_core.training.weights import left_out as left_out
+    from fluxvla_core.training.weights import external_weights as external_weights
 
-__getattr__, __dir__, __all__ = _lazy.attach(
-    __name__, {"share_buffers": "broadcast_buffers", "whole": "replicated_layout"}
-)
+_DEPRECATED = {
+    "left_out": "external_weights",
+    "share_buffers": "broadcast_buffers",
+    "whole": "replicated_layout",
+}
+__getattr__, __dir__, __all__ = _lazy.attach(__name__, _DEPRECATED)

@@ -164,8 +164,9 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.training.cost import Meter
         from fluxvla_core.training.input_sizes import check_start
         from fluxvla_core.training.model import checkpoint_activations, compile_units
+        from fluxvla_core.training.part_weights import load_part_weights
         from fluxvla_core.training.state import seed_all
-        from fluxvla_core.training.weights import base_to_note, put_parts, start_training_from
+        from fluxvla_core.training.weights import adapter_base_to_record, start_training_with
 
         # For a ``run_setup`` that calls this method alone.
         self._join()
@@ -184,11 +185,11 @@ class BaseTrainRunner(Strategy):
         own = options.init_from is None
         asked = "model.pretrained_name_or_path" if own else f"{self.context.section}.init_from"
         if init_from is None and before is None:
-            put_parts(vla, VLA.adapt(vla).part_weights)
+            load_part_weights(vla, VLA.adapt(vla).part_weights)
         with located(self.context.where(asked)):
-            start_training_from(vla, init_from, before, self.lora is not None, self.world)
+            start_training_with(vla, init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
-            self.adapter_base = base_to_note(before, init_from)
+            self.adapter_base = adapter_base_to_record(before, init_from)
             lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
         self.flops = Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:
@@ -273,7 +274,7 @@ class BaseTrainRunner(Strategy):
         return ""
 
     def check_work_dir(self) -> None:
-        """See that the work dir is still this run's; the first rank has the lock.
+        """Raise an error if the work dir is no longer this run's; the first rank has the lock.
 
         Raises:
             RunFailed: it was removed, moved or replaced.

@@ -1,4 +1,4 @@
-"""What a training costs: memory and operations, counted on the meta device; peak memory.
+"""Memory and FLOPs of a training, counted on the meta device; peak memory.
 
 The model is built on torch's meta device, and runs its forward pass with fake tensors, which have
 shapes and dtypes only: a model of seven billion parameters is counted on a laptop. Weights,
@@ -49,7 +49,7 @@ _CAST = torch.ops.aten._to_copy.default
 
 
 @dataclass(frozen=True)
-class Kept:
+class SavedActivations:
     """Bytes that a forward pass leaves for the backward pass.
 
     Args:
@@ -68,7 +68,7 @@ class Kept:
     batch: int
 
 
-NOTHING = Kept(0, 0, 0, 0, 0)
+NO_ACTIVATIONS = SavedActivations(0, 0, 0, 0, 0)
 """The footprint if the batch is not known."""
 
 
@@ -109,7 +109,7 @@ class Footprint:
 
 
 def footprint(
-    layout: Layout, kept: Kept, optimizer: int, averaged: bool, recompute: bool
+    layout: Layout, kept: SavedActivations, optimizer: int, averaged: bool, recompute: bool
 ) -> Footprint:
     """Add up the counted parts.
 
@@ -196,8 +196,10 @@ def _copied(model: nn.Module, make: Callable[[str, Tensor], Tensor]) -> nn.Modul
     return copy.deepcopy(model, known)
 
 
-def kept_by_fake(model: nn.Module, batch: Mapping[str, Any], dtype: torch.dtype | None) -> Kept:
-    """:func:`kept` of a model that :func:`fake` made; ``batch`` has tensors on a CPU.
+def fake_activations(
+    model: nn.Module, batch: Mapping[str, Any], dtype: torch.dtype | None
+) -> SavedActivations:
+    """:func:`saved_activations` of a model that :func:`fake` made; ``batch`` has tensors on a CPU.
 
     Raises:
         Exception: what a model raises that decides by the values of its inputs, or of its weights.
@@ -205,10 +207,12 @@ def kept_by_fake(model: nn.Module, batch: Mapping[str, Any], dtype: torch.dtype 
     mode: Any = model.__dict__["_fake_mode"]
     inputs = {k: mode.from_tensor(v) if isinstance(v, Tensor) else v for k, v in batch.items()}
     with mode:
-        return kept(model, inputs, dtype)
+        return saved_activations(model, inputs, dtype)
 
 
-def kept(model: nn.Module, arguments: Mapping[str, Any], dtype: torch.dtype | None) -> Kept:
+def saved_activations(
+    model: nn.Module, arguments: Mapping[str, Any], dtype: torch.dtype | None
+) -> SavedActivations:
     """Count what the forward pass of a batch leaves for the backward pass.
 
     Args:
@@ -228,7 +232,7 @@ def kept(model: nn.Module, arguments: Mapping[str, Any], dtype: torch.dtype | No
         sum(size for key, size in unit.items() if key not in left)
         for unit in counter.inside.values()
     )
-    return Kept(
+    return SavedActivations(
         activations=sum((counter.outside | inside).values()),
         recomputed=sum(left.values()),
         largest_unit=max(units, default=0),

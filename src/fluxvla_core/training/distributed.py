@@ -114,7 +114,7 @@ def _device(name: str, local_rank: int) -> torch.device:
         raise ConfigError(
             "device is 'cuda', but torch finds no GPU here",
             cause=_why_no_gpu(),
-            next="--set runner.device=auto takes the CPU where there is no GPU",
+            next="--set <section>.device=auto takes the CPU where there is no GPU",
         )
     if name == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
@@ -123,7 +123,7 @@ def _device(name: str, local_rank: int) -> torch.device:
             f"process {local_rank + 1} on this machine finds no GPU of its own: torch sees "
             f"{torch.cuda.device_count()}",
             cause="--nproc (or torchrun's --nproc-per-node) is larger than the number of GPUs",
-            next=f"--nproc {torch.cuda.device_count()}, or --set runner.device=cpu",
+            next=f"--nproc {torch.cuda.device_count()}, or --set <section>.device=cpu",
         )
     torch.cuda.set_device(local_rank)
     return torch.device("cuda", local_rank)

@@ -3,7 +3,7 @@
 An exported one lacks what only training needs, for evaluation, servers and robots. It is a
 checkpoint folder in every respect (manifest, hashes, ``load_policy``), with all weights in one
 plain safetensors file: the averaged ones in their place if they were kept, adapters merged, frozen
-parts that the model would bring itself included. Optimizer, random states and the config's
+parts that the model's constructor would load included. Optimizer, random states and the config's
 ``runner`` are left out, so that no training plugin is needed where it is used.
 
 Other projects' checkpoints are converted by the formats that plugins have.
@@ -44,7 +44,7 @@ from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, Usag
 from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training.lora import CONFIG as ADAPTER
 from fluxvla_core.training.weights import (
-    LeftOut,
+    ExternalWeights,
     load_for_inference,
     model_of,
     weights_by_name,
@@ -102,9 +102,9 @@ def _writer(target: Path, step: int, epoch: int, what: str, go_on: str) -> Check
 
 
 def _write_weights(writer: CheckpointWriter, tensors: Mapping[str, Tensor]) -> None:
-    """All weights in one file: the model brings none of them itself."""
+    """All weights in one file, those of frozen parts too."""
     TensorFile.full(ckpt.MODEL, tensors, True).write(writer)
-    writer.write_json(ckpt.TRAINER, {"left_out": LeftOut().to_dict()})
+    writer.write_json(ckpt.TRAINER, {"left_out": ExternalWeights().to_dict()})
 
 
 def _verified(checkpoint: Checkpoint, name: str) -> bytes:
@@ -139,7 +139,7 @@ def import_checkpoint(
         source: its folder, or ``hf:<id>``.
         target: the folder to make; does not exist yet, or is empty.
         format: the project that it is of; by default that is found out.
-        tokenizer: ``model_path`` of the tokenizer, for formats that bring none.
+        tokenizer: ``model_path`` of the tokenizer, for formats without one.
         embodiment: the robot, where the checkpoint describes none; without one the result can be
             trained on, and drives nothing.
         action_rate_hz: actions a second, where the checkpoint does not say it.
@@ -291,7 +291,7 @@ def _prepared(found: ForeignCheckpoint, where: str, tokenizer: str | None) -> Pi
         pipeline = Pipeline(found.transforms)
     except ConfigError as error:
         if tokenizer is None and any("tokenizer" in table for table in found.transforms):
-            error.next = "--tokenizer DIR, the folder of its tokenizer, which it does not bring"
+            error.next = "--tokenizer DIR, the folder of its tokenizer, which it does not contain"
         error.where = error.where or where
         raise
     entries = found.statistics.get("private", {})

@@ -67,10 +67,10 @@ _LOST = (
 )
 _LESS_DEVICE = (
     "lower --set train_dataloader.per_device_batch_size=… and raise --set "
-    "runner.grad_accumulation_steps=… by as much (the result stays the same), or --set "
-    "runner.enable_gradient_checkpointing=true, --set "
-    "runner.enable_mixed_precision_training=true, or split the model: --set "
-    "runner.type=FSDPTrainRunner"
+    "<section>.grad_accumulation_steps=… by as much (the result stays the same), or --set "
+    "<section>.enable_gradient_checkpointing=true, --set "
+    "<section>.enable_mixed_precision_training=true, or split the model: --set "
+    "<section>.type=FSDPTrainRunner"
 )
 _LESS_HOST = (
     "lower --set train_dataloader.per_device_num_workers=… or --set "

@@ -280,7 +280,7 @@ def clip_(parameters: list[nn.Parameter], max_norm: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Layout:
-    """What one process keeps of a model; of processes that keep different amounts, the fullest.
+    """Memory layout of a model on one process; the fullest, where they differ.
 
     Args:
         parameters: bytes of weights and buffers.

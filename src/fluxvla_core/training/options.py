@@ -8,7 +8,8 @@ from typing import Any
 
 from fluxvla_core.build import RunContext
 from fluxvla_core.config.resolve import LOADER_KEYS
-from fluxvla_core.errors import ConfigError, Problem, nearest
+from fluxvla_core.config.similar_keys import similar_key
+from fluxvla_core.errors import ConfigError, Problem
 from fluxvla_core.training.lora import LoraOptions, check_installed, is_count, is_positive
 from fluxvla_core.training.optimizers import make_schedule
 
@@ -242,7 +243,7 @@ class LoaderOptions:
             )
         problems: list[tuple[str, str]] = []
         for key in (key for key in table if key not in LOADER_KEYS):
-            near = nearest(key, LOADER_KEYS)
+            near = similar_key(key, LOADER_KEYS)
             hint = f"did you mean {near!r}?" if near else f"known: {', '.join(LOADER_KEYS)}"
             problems.append((key, f"unknown key; {hint}"))
         options = cls(

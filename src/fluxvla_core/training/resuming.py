@@ -22,7 +22,7 @@ from fluxvla_core.checkpoints.checkpoint import (
     Checkpoint,
     clear_leftovers,
     name_best,
-    newest_whole,
+    newest_undamaged,
     refuse_existing,
     set_aside_later,
 )
@@ -41,7 +41,7 @@ from fluxvla_core.training.state import (
     seeds_of,
     set_rng_state,
 )
-from fluxvla_core.training.weights import LeftOut, SavedWeights, check_model_tensors
+from fluxvla_core.training.weights import ExternalWeights, SavedWeights, check_model_tensors
 
 AUTO = "auto"
 
@@ -54,7 +54,7 @@ def choose_checkpoint(
     Also clears what killed saves left in the work dir, which is this run's own by now.
 
     Args:
-        resume: ``auto`` (the newest whole one; a damaged newer one is named and passed over), a
+        resume: ``auto`` (the newest undamaged one; a damaged newer one is named and passed over), a
             path (refused if damaged), or None (refused if there are checkpoints already).
         first: a path for ``auto`` where the work dir has no checkpoint yet: a restart before the
             first save starts from where the run did.
@@ -91,7 +91,7 @@ def _choose(context: RunContext, resume: str | None, first: str | None) -> str:
 
 
 def _newest(context: RunContext) -> Checkpoint | None:
-    checkpoint, refused = newest_whole(context.work_dir)
+    checkpoint, refused = newest_undamaged(context.work_dir)
     if checkpoint is None and refused:
         raise refused[0]
     for error in refused:
@@ -102,19 +102,21 @@ def _newest(context: RunContext) -> Checkpoint | None:
 
 
 def load_weights(
-    checkpoint: Checkpoint, model: nn.Module, brings: LeftOut | None
+    checkpoint: Checkpoint, model: nn.Module, external: ExternalWeights | None
 ) -> dict[str, Tensor]:
     """The checkpoint's weights by name; all fit ``model``.
 
     Args:
-        brings: the frozen weights that the model brings itself.
+        external: the frozen weights that the model's constructor loaded.
 
     Raises:
         CheckpointError: they are another model's, or other frozen weights go with them.
     """
     tensors = checkpoint.tensors(MODEL) | adapter_tensors(model, checkpoint)
     saved = checkpoint.json(TRAINER, SavedWeights)["left_out"]
-    check_model_tensors(model, tensors, brings or LeftOut(), saved, str(checkpoint.path))
+    check_model_tensors(
+        model, tensors, external or ExternalWeights(), saved, str(checkpoint.path), resuming=True
+    )
     return tensors
 
 
@@ -134,7 +136,7 @@ def state_of(what: str, where: str) -> Iterator[None]:
 def forget_missing(
     progress: Progress, world: World, work_dir: Path, resumed: Checkpoint | None
 ) -> None:
-    """Let ``progress`` forget checkpoints that the ``resumed`` one knows and this work dir lacks.
+    """Remove from ``progress`` the checkpoints that this work dir lacks.
 
     The best one may have been removed in favour of a better one that was lost since. Of a
     checkpoint from elsewhere, neither itself nor the best one before it is here.
@@ -151,7 +153,7 @@ def forget_missing(
 
 
 def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
-    """Give this rank the random states it was saved with, or fresh ones of its own.
+    """Restore this rank's random states from the checkpoint, or seed new ones.
 
     With another number of ranks than before there are none to restore: each rank then draws from
     a state that follows from the seed, its rank and the step.
@@ -263,7 +265,7 @@ def _listed(seeds: Sequence[int | None]) -> str:
 
 
 def _begin_another(checkpoint: str) -> str:
-    weights = shlex.quote(f"runner.init_from={checkpoint}")
+    weights = shlex.quote(f"<section>.init_from={checkpoint}")
     return f"begin another run from these weights: --set {weights} --work-dir OTHER"
 
 

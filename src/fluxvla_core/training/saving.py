@@ -244,7 +244,7 @@ class Saver:
         files: Sequence[TensorFile],
         write: Callable[[World, Iterable[TensorFile], Callable[[str], None]], None],
     ) -> None:
-        """Let ``write(world, files, warn)`` make the checkpoint; all ranks call it.
+        """Start a save: ``write(world, files, warn)`` makes the checkpoint; all ranks call it.
 
         The one before must have been finished with :meth:`finish_pending`.
         """

@@ -1,4 +1,4 @@
-"""What a training continues from: progress, optimizer state, averaged weights, random generators.
+"""State of a training: progress, optimizer, averaged weights, random generators.
 
 Each has a form that checkpoints hold: JSON values, or tensors by name.
 """

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from fluxvla_core.training.model import ForwardArguments, Layout
     from fluxvla_core.training.saving import Saver, Snapshot
     from fluxvla_core.training.state import Ema, Progress
-    from fluxvla_core.training.weights import LeftOut
+    from fluxvla_core.training.weights import ExternalWeights
 
 _NO_CONTEXT = nullcontext()
 
@@ -63,7 +63,8 @@ class Strategy(TrainRunner):
     lr_scheduler: Any = None
     flops: Meter | None = None
     adapter_base: str | None = None
-    left_out: LeftOut | None = None
+    external_weights: ExternalWeights | None = None
+    """Frozen weights that checkpoints do not contain; found when the training begins."""
     resume_checkpoint: Checkpoint | None = None
     """The checkpoint that the run resumes from; None for a fresh start."""
     # Known inside run().
@@ -98,7 +99,7 @@ class Strategy(TrainRunner):
         return vla.to(self.world.device)
 
     def memory_layout(self, model: nn.Module, processes: int, device_type: str) -> Layout:
-        """What one of so many processes keeps of ``model``: for the estimate of a dry run.
+        """Memory layout of ``model`` on one of ``processes``, for the estimate of a dry run.
 
         Here everything, as where ``_wrap_model`` copies the model. A strategy that divides it
         overrides this. Nothing is allocated, no process group is there.
@@ -173,6 +174,17 @@ class Strategy(TrainRunner):
 
     def warm_up(self, batch: dict[str, Any]) -> None:
         """Deprecated name of :meth:`before_first_step`."""
+
+    @property
+    def left_out(self) -> ExternalWeights | None:
+        """Deprecated name of :attr:`external_weights`."""
+        _warn_of_left_out()
+        return self.external_weights
+
+    @left_out.setter
+    def left_out(self, found: ExternalWeights | None) -> None:
+        _warn_of_left_out()
+        self.external_weights = found
 
     def clip_grad_norm(self) -> Tensor | None:
         """Scale the gradients down to ``max_grad_norm``; their norm before, on the device.
@@ -249,16 +261,17 @@ class Strategy(TrainRunner):
         self.hooks.call("checkpoint_saved", path=saved.path, step=saved.step)
 
     def _snapshot(self, train_loss: float | None, only_trainable: bool) -> Snapshot:
-        """The present moment, without frozen weights that the model brings itself if so asked."""
+        """The present moment, without :attr:`external_weights` if so asked."""
         from fluxvla_core.training import lora
         from fluxvla_core.training.saving import Snapshot, run_documents, run_folders
         from fluxvla_core.training.state import seeds_of
-        from fluxvla_core.training.weights import LeftOut
+        from fluxvla_core.training.weights import ExternalWeights
 
-        brings = self.left_out if only_trainable and self.left_out is not None else LeftOut()
+        external = self.external_weights if only_trainable else None
+        external = external or ExternalWeights()
         tensors, (optimizer, described) = self.model_tensors(), self.optimizer_tensors()
         adapter = lora.adapter_names(self.model)
-        elsewhere = {*brings.names, *adapter}
+        elsewhere = {*external.names, *adapter}
         documents: dict[str, Mapping[str, Any]] = {}
         if self.world.is_rank0:
             documents |= run_documents(self.context, self.dataset, self.model)
@@ -275,7 +288,7 @@ class Strategy(TrainRunner):
                 "metric": self.metric.state_dict(),
                 "data_seeds": seeds_of(self.dataset),
                 **self.plan.to_dict(),
-                "left_out": brings.to_dict(),
+                "left_out": external.to_dict(),
             },
             ema=self.ema,
             adapter={theirs: tensors[name] for name, theirs in adapter.items()},
@@ -305,7 +318,7 @@ class Strategy(TrainRunner):
         )
         for note in notes if self.world.is_rank0 else ():
             self.context.reporter.warn(note)
-        self._load_model_state(resuming.load_weights(checkpoint, self.model, self.left_out))
+        self._load_model_state(resuming.load_weights(checkpoint, self.model, self.external_weights))
         described = checkpoint.json(ckpt.OPTIMIZER_META, SavedOptimizer)
         optimizer = checkpoint.optimizer_tensors()
         if self.load_optimizer_tensors(optimizer, described, where) is False:
@@ -336,7 +349,7 @@ class Strategy(TrainRunner):
         return {"step": self.plan.total_steps(self.max_steps, self.max_epochs) - left}
 
     def _load_model_state(self, state: Mapping[str, Tensor]) -> None:
-        """Put a checkpoint's weights, whole and by name, into the model; all of them fit."""
+        """Load a checkpoint's full tensors, by name, into the model; all of them fit."""
         from fluxvla_core.training.weights import load_full_tensors
 
         load_full_tensors(self.model, state)
@@ -412,3 +425,8 @@ class Strategy(TrainRunner):
             self.options.seed,
             shards,
         )
+
+
+def _warn_of_left_out() -> None:
+    message = "left_out is deprecated, use external_weights"
+    warnings.warn(message, DeprecationWarning, stacklevel=3)

@@ -28,7 +28,7 @@ from fluxvla_core.training.state import Ema
 from fluxvla_core.training.step_metrics import Step, StepMetrics
 from fluxvla_core.training.stop import StopRequest
 from fluxvla_core.training.validation import NotFinite, Validation, validation_dataset
-from fluxvla_core.training.weights import left_out
+from fluxvla_core.training.weights import external_weights
 
 if TYPE_CHECKING:
     from fluxvla_core.training.strategy import Strategy
@@ -79,8 +79,8 @@ class Trainer:
         where = context.where(f"{context.section}.collator")
         runner.forward_arguments = ForwardArguments(runner.model, where)
         check_observations(observations_of(runner.model), dataset, context)
-        if runner.left_out is None:
-            runner.left_out = left_out(runner.model)
+        if runner.external_weights is None:
+            runner.external_weights = external_weights(runner.model)
         if options.ema_decay is not None:
             runner.ema = Ema(trainable(runner.model), options.ema_decay)
 

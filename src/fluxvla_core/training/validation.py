@@ -137,7 +137,7 @@ def validation_dataset(context: RunContext, train: Any, seed: int) -> Any:
 
 
 def share_statistics(train: Any, val: Any) -> None:
-    """Let the ``val`` dataset normalise as ``train`` does.
+    """Normalise the ``val`` dataset by the statistics of ``train``.
 
     Raises:
         ConfigError: it is of a robot for which the training data have no statistics.

@@ -1,14 +1,10 @@
-"""Model weights: from a checkpoint, or for parts of a model from published weights of their own.
-
-A vision tower or a language model is published alone, under the names of the project that it comes
-from; the rest of the model is drawn anew. Which names correspond, the model says (``PartWeights``).
-"""
+"""Model weights: by name, of checkpoints and exports, and which of them checkpoints lack."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,17 +16,13 @@ from torch import Tensor, nn
 from fluxvla_core.build import build_vla_from_cfg
 from fluxvla_core.checkpoints.checkpoint import EMA, MODEL, TRAINER, Checkpoint
 from fluxvla_core.checkpoints.foreign import (
-    HUB,
     explain_other_family,
     foreign_folder,
     is_foreign,
     read_foreign,
-    safetensors_in,
-    torch_table,
 )
-from fluxvla_core.checkpoints.shards import Stored, StoredTensors
+from fluxvla_core.checkpoints.shards import Stored
 from fluxvla_core.checkpoints.tensors import check_names, read_tensors, shard_like
-from fluxvla_core.contracts.training import PartWeights
 from fluxvla_core.data.transforms.pipeline import redirected
 from fluxvla_core.errors import CheckpointError
 from fluxvla_core.training import lora
@@ -39,8 +31,8 @@ from fluxvla_core.training.model import before_its_weights, frozen_sources, set_
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """Frozen weights that are not saved because the model brings them itself.
+class ExternalWeights:
+    """Frozen weights that checkpoints do not contain: the model's constructor loads them.
 
     A module says so by ``frozen_source``: where its frozen weights come from when it is built
     (a package, a file). ``sha256`` proves on loading that they are still the same.
@@ -56,8 +48,8 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class SavedLeftOut:
-    """:class:`LeftOut` in ``trainer.json``."""
+class SavedExternalWeights:
+    """:class:`ExternalWeights` in ``trainer.json``."""
 
     sources: dict[str, str] = field(default_factory=dict)
     sha256: str = ""
@@ -67,11 +59,11 @@ class SavedLeftOut:
 class SavedWeights:
     """The fields of ``trainer.json`` that every checkpoint has, exported ones too."""
 
-    left_out: SavedLeftOut
+    left_out: SavedExternalWeights
 
 
-def left_out(model: nn.Module) -> LeftOut:
-    """The :class:`LeftOut` weights of ``model``; reads them once to hash them."""
+def external_weights(model: nn.Module) -> ExternalWeights:
+    """The :class:`ExternalWeights` of ``model``; reads them once to hash them."""
     sources = frozen_sources(model)
     state = model.state_dict(keep_vars=True)
     # What stands in no part by itself but in the whole model may be a buffer that training changes.
@@ -86,7 +78,7 @@ def left_out(model: nn.Module) -> LeftOut:
         flat = state[name].detach().cpu().contiguous().reshape(-1)
         digest.update(name.encode() + str(tuple(state[name].shape)).encode())
         digest.update(memoryview(flat.view(torch.uint8).numpy()) if flat.numel() else b"")
-    return LeftOut(sources, names, digest.hexdigest() if names else "")
+    return ExternalWeights(sources, names, digest.hexdigest() if names else "")
 
 
 def weights_by_name(model: nn.Module, without: Iterable[str] = ()) -> dict[str, Tensor]:
@@ -119,28 +111,30 @@ def load_full_tensors(model: nn.Module, tensors: Mapping[str, Tensor | Stored]) 
 def check_model_tensors(
     model: nn.Module,
     tensors: Mapping[str, Tensor],
-    brings: LeftOut,
+    external: ExternalWeights,
     saved: Mapping[str, Any],
     where: str,
+    resuming: bool = False,
 ) -> None:
     """Refuse weights that are not all of this model's, or were trained with other frozen ones.
 
     Args:
         tensors: the checkpoint's weights.
-        brings: the weights that the model brings itself.
+        external: the weights that the model's constructor loaded.
         saved: ``left_out`` of ``trainer.json``.
+        resuming: a training resumes from them, whose ``init_from`` names an adapter's base.
 
     Raises:
         CheckpointError: lists what differs.
     """
-    brings = brings if saved.get("sha256") else LeftOut()
-    if brings.sha256 != saved.get("sha256", ""):
-        raise _other_frozen(brings, saved, bool(lora.adapter_names(model)), where)
-    check_names(tensors, weights_by_name(model, brings.names), "the weights", where)
+    external = external if saved.get("sha256") else ExternalWeights()
+    if external.sha256 != saved.get("sha256", ""):
+        raise _other_frozen(external, saved, bool(lora.adapter_names(model)), where, resuming)
+    check_names(tensors, weights_by_name(model, external.names), "the weights", where)
 
 
 def _other_frozen(
-    ours: LeftOut, saved: Mapping[str, Any], adapter: bool, where: str
+    ours: ExternalWeights, saved: Mapping[str, Any], adapter: bool, where: str, resuming: bool
 ) -> CheckpointError:
     """Frozen weights, or an adapter's base, are not those that the checkpoint was trained with."""
     what = "frozen weights differ from those that the checkpoint was trained with"
@@ -150,8 +144,10 @@ def _other_frozen(
             f"{what} (the model from {now}; then from {before})",
             where=where,
             cause="init_from was changed, or that place has other weights by now",
-            next=f"--set runner.init_from=DIR, where the weights of {before} are; or resume "
-            "without it",
+            next=f"--set <section>.init_from=DIR, where the weights of {before} are; or resume "
+            "without it"
+            if resuming
+            else f"put the weights that the adapter was trained on back to {before}",
         )
     places = {**saved.get("sources", {}), **ours.sources}
     listed = "; ".join(f"{name or 'the model'} from {place}" for name, place in places.items())
@@ -199,15 +195,17 @@ def load_for_inference(model: nn.Module, checkpoint: Checkpoint) -> None:
     options = lora.LoraOptions.of_checkpoint(checkpoint)
     trained = {name: p.requires_grad for name, p in model.named_parameters()}
     if options is not None:
-        base = base_of(checkpoint)
+        base = adapter_base_place(checkpoint)
         if base is not None:
-            start_from(model, base)
+            load_initial_weights(model, base)
             set_frozen_source(model, base)
         lora.attach(model, options, trained=True)
     tensors = checkpoint.tensors(MODEL) | lora.adapter_tensors(model, checkpoint)
     if checkpoint.has(EMA):
         tensors |= _by_all_names(model, checkpoint.tensors(EMA))
-    check_model_tensors(model, tensors, left_out(model), saved, str(checkpoint.path / MODEL))
+    check_model_tensors(
+        model, tensors, external_weights(model), saved, str(checkpoint.path / MODEL)
+    )
     load_full_tensors(model, tensors)
     if options is not None:
         lora.merge_(model)
@@ -224,7 +222,7 @@ def _by_all_names(model: nn.Module, tensors: Mapping[str, Tensor]) -> dict[str, 
     return {**tensors, **others}
 
 
-def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
+def adapter_base_place(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
     """Where the base weights of a checkpoint's adapter are; None if it needs none.
 
     They are where they were found, or else, as folders are moved together, at the place that was
@@ -233,7 +231,7 @@ def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
     Args:
         init_from: the place that is asked for now, which goes first when it is a new one.
     """
-    noted = _noted_base(checkpoint)
+    noted = _recorded_adapter_base(checkpoint)
     if noted is None:
         return None
     asked, found = noted
@@ -242,7 +240,7 @@ def base_of(checkpoint: Checkpoint, init_from: str | None = None) -> str | None:
     return next((place for place in (found, asked) if Path(place).exists()), found)
 
 
-def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None:
+def adapter_base_to_record(before: Checkpoint | None, init_from: str | None) -> str | None:
     """Where the base of an adapter was asked for; None if its checkpoints need no others' weights.
 
     Args:
@@ -250,11 +248,11 @@ def base_to_note(before: Checkpoint | None, init_from: str | None) -> str | None
     """
     if before is None:
         return init_from
-    noted = _noted_base(before)
+    noted = _recorded_adapter_base(before)
     return None if noted is None else init_from or noted[0]
 
 
-def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
+def _recorded_adapter_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
     """Where a checkpoint's base was asked for, and found."""
     if not checkpoint.has(lora.CONFIG):
         return None
@@ -263,7 +261,7 @@ def _noted_base(checkpoint: Checkpoint) -> tuple[str, str] | None:
     return None if asked is None or found is None else (asked, found)
 
 
-def exact_place(place: str | Path) -> str:
+def resolve_weights(place: str | Path) -> str:
     """The safetensors file or the checkpoint's own folder that ``place`` means at this moment.
 
     Which one is a work dir's newest, or its ``best``, changes while that run continues.
@@ -277,8 +275,8 @@ def exact_place(place: str | Path) -> str:
     return str(path if path.suffix == ".safetensors" else Checkpoint.open(path).path)
 
 
-def start_from(model: nn.Module, place: str | Path) -> Path:
-    """Give a freshly built ``model`` the weights of another training, or of an export.
+def load_initial_weights(model: nn.Module, place: str | Path) -> Path:
+    """Load the weights of another training, or of an export, into a freshly built ``model``.
 
     Args:
         place: a checkpoint's folder, a work dir (its newest one), a safetensors file, or another
@@ -308,139 +306,29 @@ def start_from(model: nn.Module, place: str | Path) -> Path:
 
 
 def _put_all(model: nn.Module, tensors: Mapping[str, Tensor | Stored], path: Path) -> Path:
-    brings = left_out(model).names - set(tensors)
-    check_names(tensors, weights_by_name(model, brings), "the weights", str(path))
+    external = external_weights(model).names - set(tensors)
+    check_names(tensors, weights_by_name(model, external), "the weights", str(path))
     load_full_tensors(model, tensors)
     return path
 
 
-def start_training_from(
+def start_training_with(
     model: nn.Module, init_from: str | None, before: Checkpoint | None, adapter: bool, world: World
 ) -> None:
-    """Give a freshly built ``model`` the weights that ``init_from`` names, if any.
+    """Load the weights that ``init_from`` names, if any, into a freshly built ``model``.
 
     Args:
         before: what the run resumes from: all weights are in it, but for an adapter's base.
         adapter: the model is an adapter's base, whose weights are not saved.
     """
-    place = base_of(before, init_from) if before is not None else init_from
+    place = adapter_base_place(before, init_from) if before is not None else init_from
     if place is None:
         return
     # Found once: ranks that looked one after the other could find different ones.
-    found = start_from(model, run_on_rank0(world, lambda: exact_place(place)))
+    found = load_initial_weights(model, run_on_rank0(world, lambda: resolve_weights(place)))
     if adapter:
         set_frozen_source(model, str(found))
 
 
 def _inside(name: str, prefix: str) -> bool:
     return not prefix or name.startswith(prefix + ".")
-
-
-_SHOWN = 6
-_PICKLED = (".pt", ".pth", ".bin")
-_INSIDE = ("model", "state_dict")
-"""Keys under which a file may have its table of tensors."""
-
-
-def put_parts(model: nn.Module, parts: Sequence[PartWeights]) -> None:
-    """Give parts of a freshly built ``model`` their published weights.
-
-    Raises:
-        CheckpointError: a file is missing or damaged, or its tensors are not those of the part;
-            lists missing and left-over ones, and those of another size.
-    """
-    for part in parts:
-        load_full_tensors(model, matched(tensors_at(part.place), weights_by_name(model), part))
-
-
-def matched(
-    tensors: Mapping[str, Tensor | Stored], wanted: Mapping[str, Tensor], part: PartWeights
-) -> dict[str, Tensor | Stored]:
-    """``tensors`` under the names of ``wanted``, as far as ``part`` names them.
-
-    Raises:
-        CheckpointError: as ``put_parts``.
-    """
-    source_names = {name: other for name in wanted if (other := _other_name(name, part.names))}
-    if not source_names:
-        parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in wanted))
-        raise CheckpointError(
-            f"no weight of the model has {' or '.join(map(repr, part.names))} in its name",
-            where=part.place,
-            cause=f"the model's parts are {parts}",
-        )
-    available = {name for name, other in source_names.items() if other in tensors}
-    tied = {id(wanted[name]) for name in available}  # two names here of what has one name there
-    missing = [
-        n
-        for name, n in source_names.items()
-        if name not in available and id(wanted[name]) not in tied
-    ]
-    used = set(source_names.values())
-    extra = [n for n in tensors if n not in used and not any(text in n for text in part.unread)]
-    sizes = [
-        f"{source_names[name]}: {tuple(tensors[source_names[name]].shape)} there, "
-        f"{tuple(wanted[name].shape)} here"
-        for name in sorted(available)
-        if tensors[source_names[name]].shape != wanted[name].shape
-    ]
-    kinds = (("missing", missing), ("left over", extra), ("of another size", sizes))
-    lines = [
-        f"    {len(items)} {kind}: {', '.join(sorted(items)[:_SHOWN])}"
-        f"{' …' if len(items) > _SHOWN else ''}"
-        for kind, items in kinds
-        if items
-    ]
-    if lines:
-        named = ", ".join(f"{own!r} is {other!r} there" for own, other in part.names.items())
-        raise CheckpointError(
-            "the tensors are not those of the part that they are for:\n" + "\n".join(lines),
-            where=part.place,
-            cause="they are of another model, or their names correspond in another way to those "
-            f"here: {named}",
-        )
-    return {name: tensors[source_names[name]] for name in sorted(available)}
-
-
-def tensors_at(place: str | Path) -> Mapping[str, Tensor | Stored]:
-    """The tensors of a safetensors file, a folder of them (or ``hf:<id>``), or a file of torch's.
-
-    A file of ``torch.save`` is read as data only: no object in it is built.
-
-    Raises:
-        CheckpointError: there is nothing there, or it holds no table of tensors.
-    """
-    path = Path(place).expanduser()
-    if str(place).startswith(HUB) or path.is_dir():
-        folder = foreign_folder(place)
-        if any((folder / f"model.safetensors{end}").is_file() for end in ("", ".index.json")):
-            return safetensors_in(folder)
-        files = sorted(folder.glob("*.safetensors"))
-        if not files:
-            raise CheckpointError("there is no safetensors file", where=str(folder))
-        return StoredTensors(files)
-    if not path.is_file():
-        raise CheckpointError(f"there are no weights at {path}")
-    if path.suffix == ".safetensors":
-        return StoredTensors([path])
-    if path.suffix in _PICKLED:
-        return _of_torch(path)
-    raise CheckpointError(
-        f"weights are read from files that end in .safetensors, {', '.join(_PICKLED)}, or a folder",
-        where=str(path),
-    )
-
-
-def _other_name(name: str, names: Mapping[str, str]) -> str | None:
-    """What the weight ``name`` is called there, by the longest of ``names`` that is in it."""
-    own = max((text for text in names if text in name), key=len, default=None)
-    return None if own is None else name.replace(own, names[own], 1)
-
-
-def _of_torch(path: Path) -> dict[str, Tensor]:
-    content = torch_table(path)
-    tables = (content[key] for key in _INSIDE if isinstance(content.get(key), dict))
-    found: dict[str, Any] = next(tables, content)
-    if not all(isinstance(value, Tensor) for value in found.values()):
-        raise CheckpointError("it holds no table of tensors", where=str(path))
-    return {str(name): tensor for name, tensor in found.items()}

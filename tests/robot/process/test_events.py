@@ -18,12 +18,12 @@ from fluxvla_core.robot.events import (
     EpisodePrepared,
     EpisodeStarted,
     Event,
-    FilterLeftOut,
+    FilterSkipped,
+    HistoryObserved,
     Observed,
+    ObservedFrame,
     Phase,
     Refused,
-    Remembered,
-    RobotReading,
     Stopped,
     StoppedWhileHeld,
 )
@@ -36,7 +36,7 @@ CLAMPS = (
     Clamp("jaw", float("inf"), 0.0, "velocity"),
 )
 TASK = Task("1", "wave", False)
-READING = RobotReading({}, None, POSE, 1.0, 1.0, {})
+READING = ObservedFrame({}, None, POSE, 1.0, 1.0, {})
 SENT = [
     SentCommand(POSE, POSE * 0.5, CLAMPS),
     SentCommand(POSE, POSE, (), held=True),
@@ -56,13 +56,13 @@ TOLD = [
     EpisodeEnded(
         5.0, "failed", None, "no chunk", 3, (Trip("chunk", "x", 4.5), Trip("run", "y", 4.6))
     ),
-    FilterLeftOut(6.0, "Slow"),
+    FilterSkipped(6.0, "Slow"),
 ]
 OWN = [
     EpisodePrepared(0.0, TASK, 7, 50.0),
     EpisodeStarted(0.0, TASK),
     Observed(0.0, READING),
-    Remembered(0.0, READING),
+    HistoryObserved(0.0, READING),
     Refused(0.0, "chunk", {}),
     ChunkAccepted(0.0, READING, POSE[None], {}),
 ]

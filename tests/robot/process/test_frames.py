@@ -51,8 +51,8 @@ def ends():
 
 def through(ends, message):
     main, control = ends
-    main.ask()
-    control.wait_for_question()
+    main.request()
+    control.wait_for_request()
     control.answer(message)
     assert main.answered(10.0)
     return main.take()
@@ -194,7 +194,7 @@ from fluxvla_core.robot.process.frames import FrameChannel, FrameMemory, FrameMe
 
 channel = FrameChannel(FrameMemory(*map(int, sys.argv[1:])))
 for number in range(200):
-    channel.wait_for_question()
+    channel.wait_for_request()
     channel.answer(FrameMessage({"number": number}, {"a": np.full((64, 48, 3), number, np.uint8)}))
 """
 
@@ -205,7 +205,7 @@ def test_every_answer_of_another_process_is_whole_and_new():
     command = [sys.executable, "-c", OTHER, *map(str, memory)]
     with subprocess.Popen(command, pass_fds=memory) as process:
         for number in range(200):
-            channel.ask()
+            channel.request()
             until = time.monotonic() + 30
             while not channel.answered(0.05):
                 assert time.monotonic() < until
@@ -223,7 +223,7 @@ def answering(operator, looks):
 
     def answer():
         for message in looks:
-            control.wait_for_question()
+            control.wait_for_request()
             if message is not None:
                 control.answer(message)
 

@@ -223,6 +223,6 @@ def test_a_robot_whose_first_frame_never_comes(tmp_path, module):
     )  # fmt: skip
     runner.run_setup()
 
-    with pytest.raises(NotReady, match=r"no complete reading within 0\.5 s: the camera warms up"):
+    with pytest.raises(NotReady, match=r"no complete frame within 0\.5 s: the camera warms up"):
         runner.run()
     assert not (tmp_path / "sent").exists()

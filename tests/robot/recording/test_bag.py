@@ -56,7 +56,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_values_come_back_exactly_and_in_order(folder: Path) -> None:
     found = open_recording(folder)
-    assert found.whole
+    assert found.finished
     assert [e["event"] for e in found.events] == ["start"] + ["command"] * 20
     assert found.commands()[1][:, 0].tolist() == [n / 7 for n in range(20)]
     assert found.images[CAMERA].read(7).tolist() == solid(7).tolist()
@@ -140,10 +140,16 @@ def test_jpegs_need_opencv_to_be_read(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_pictures_is_a_deprecated_name_of_images(folder: Path) -> None:
     recorded, content = open_recording(folder), read_bag(folder / f"{folder.name}.mcap")
-    with pytest.warns(DeprecationWarning, match=r"Recorded.pictures is deprecated, use images"):
+    with pytest.warns(
+        DeprecationWarning, match=r"RecordedEpisode.pictures is deprecated, use images"
+    ):
         assert recorded.pictures is recorded.images
     with pytest.warns(DeprecationWarning, match=r"BagContent.pictures is deprecated, use images"):
         assert content.pictures is content.images
+    with pytest.warns(DeprecationWarning, match=r"BagContent.whole is deprecated, use finished"):
+        assert content.whole is content.finished
+    with pytest.warns(DeprecationWarning, match=r"Episode.whole is deprecated, use finished"):
+        assert recorded.whole is recorded.finished
 
 
 def test_the_newest_image_by_a_time(folder: Path) -> None:
@@ -165,12 +171,12 @@ def test_what_is_cut_anywhere_is_read_up_to_there_and_can_be_finished(folder: Pa
     bag.write_bytes(content[: len(content) // 2])
     (folder / "metadata.yaml").unlink()
     left = open_recording(folder)
-    assert not left.whole
+    assert not left.finished
 
     assert finish_recording(folder) is True
 
     again = open_recording(folder)
-    assert again.whole
+    assert again.finished
     assert again.events == left.events
     assert json.loads((folder / "episode.json").read_text())["outcome"] == "cut short"
     assert finish_recording(folder) is False
@@ -250,7 +256,7 @@ def test_what_the_robot_cannot_give_hurts_nothing_else(tmp_path: Path) -> None:
     trace = EpisodeTrace(tmp_path / "e", 10.0, Recording(NAMES, (CAMERA,), broken))
     trace.write({**START, "embodiment": SPEC.to_dict()})
     trace.close({})
-    assert open_recording(tmp_path / "e").whole
+    assert open_recording(tmp_path / "e").finished
 
 
 def test_events_beyond_the_limit_are_counted(
@@ -259,7 +265,7 @@ def test_events_beyond_the_limit_are_counted(
     monkeypatch.setattr("fluxvla_core.robot.recording.trace._WAITING_EVENTS", 0)
     trace = EpisodeTrace(tmp_path / "e", None)
     trace.write({"event": "start", "t": 0.0})
-    assert trace.close({})["dropped"] == {"frames": 0, "pictures": 0, "events": 1}
+    assert trace.close({})["dropped"] == {"frames": 0, "images": 0, "events": 1}
 
 
 def test_images_that_a_robot_lost_before_they_were_asked_for_are_counted(tmp_path: Path) -> None:
@@ -275,5 +281,5 @@ def test_images_that_a_robot_lost_before_they_were_asked_for_are_counted(tmp_pat
     while len(asked) < 3:
         time.sleep(0.01)
     summary = trace.close({})
-    assert summary["dropped"]["pictures"] == 2 * (len(asked) - 1)
+    assert summary["dropped"]["images"] == 2 * (len(asked) - 1)
     assert len(open_recording(tmp_path / "e").images[CAMERA]) == len(asked)

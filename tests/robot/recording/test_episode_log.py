@@ -17,13 +17,18 @@ EVENTS = [
 
 def test_counts_and_timings() -> None:
     end = {"event": "end", "t": 0.3, "outcome": "done", "success": True, "problem": None}
-    found = summarise([*EVENTS, {**end, "skipped_beats": 2, "trips": []}])
+    found = summarise([*EVENTS, {**end, "skipped_ticks": 2, "trips": []}])
     assert (found["outcome"], found["success"], found["problem"]) == ("done", True, None)
-    assert (found["steps"], found["chunks"], found["skipped_beats"]) == (1, 1, 2)
+    assert (found["steps"], found["chunks"], found["skipped_ticks"]) == (1, 1, 2)
     assert (found["embodiment"], found["joints"], found["robot"]) == ("arm", ["a"], "Arm")
     assert found["clamps"] == {"a": {"velocity": 2}}
     assert list(found["timings"]) == ["receipt", "sync", "policy", "late"]
     assert found["timings"]["late"]["count"] == 1
+
+
+def test_skipped_ticks_are_read_under_their_former_key() -> None:
+    end = {"event": "end", "t": 0.3, "outcome": "done", "skipped_beats": 2}
+    assert summarise([*EVENTS, end])["skipped_ticks"] == 2
 
 
 def test_filters_that_were_late_are_counted_by_name() -> None:

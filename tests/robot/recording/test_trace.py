@@ -26,7 +26,7 @@ def test_lines_come_in_order_with_arrays_as_lists(tmp_path):
     assert json.loads(lines[2])["chunk"] == [[2.0, 3.0], [4.0, 5.0]]
     assert json.loads((tmp_path / "e" / "episode.json").read_text()) == {
         "outcome": "done",
-        "dropped": {"frames": 0, "pictures": 0, "events": 0},
+        "dropped": {"frames": 0, "images": 0, "events": 0},
     }
     assert sorted(p.name for p in (tmp_path / "e").iterdir()) == ["episode.json", "trace.jsonl"]
 

@@ -1,1 +1,1 @@
-"""Data-parallel training with a whole model on every process."""
+"""Data-parallel training with a full copy of the model on every process."""

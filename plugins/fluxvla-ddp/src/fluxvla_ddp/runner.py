@@ -1,4 +1,4 @@
-"""``DDPTrainRunner``: a whole model on every process, gradients averaged between them."""
+"""``DDPTrainRunner``: a copy of the model on every process, gradients averaged between them."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def put_master_weights(
 
 
 def on_host(tensor: Tensor, first: bool) -> Tensor:
-    """A copy of a whole tensor in host memory; an empty one but on the first rank."""
+    """A copy of a full tensor in host memory; an empty one but on the first rank."""
     return tensor.detach().to("cpu", copy=True) if first else tensor.new_empty(0)
 
 
@@ -101,7 +101,7 @@ def read_state(
     parameters: Mapping[str, nn.Parameter],
     first: bool,
 ) -> dict[str, Tensor]:
-    """The state of ``inner`` as whole tensors ``<parameter>/<key>``; all ranks call it.
+    """The state of ``inner`` as full tensors ``<parameter>/<key>``; all ranks call it.
 
     They are in host memory, of the first rank; the others have empty ones.
     """

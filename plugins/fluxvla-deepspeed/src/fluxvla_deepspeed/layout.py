@@ -32,7 +32,7 @@ def partitioned(model: nn.Module, stage: int, processes: int) -> Layout:
 
 
 def _flat(model: nn.Module, stage: int, processes: int) -> Layout:
-    """Stages 1 and 2: whole weights, flat by group; of its part each process has a copy, too."""
+    """Stages 1 and 2: full weights, flat by group; of its part each process has a copy, too."""
     step = ALIGNMENT * processes
     counts = [sum(p.numel() for p in group["params"]) for group in decay_groups(model, 0.0)]
     flats = [math.ceil(count / step) * step for count in counts]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class DeepSpeedTrainRunner(BaseTrainRunner):
     """Training with DeepSpeed's ZeRO, on GPUs over NCCL and on CPUs over gloo.
 
-    Checkpoints are those of every other strategy: whole tensors by parameter name, which another
+    Checkpoints are those of every other strategy: full tensors by parameter name, which another
     runner, or another number of processes, can go on from.
 
     Args:
@@ -47,7 +47,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
             raise ConfigError(
                 "ema_decay does not go together with zero_stage 3",
                 where=self.context.where(f"{self.context.section}.ema_decay"),
-                cause="no process holds whole weights between steps to average",
+                cause="no process holds full weights between steps to average",
                 next="use zero_stage 2, or FSDPTrainRunner, which averages its parts",
             )
         if find_spec("deepspeed") is None:
@@ -79,7 +79,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
 
     def _build_optimizer(self) -> torch.optim.Optimizer:
         """The config's optimizer; from here on its groups hold ZeRO's flat parts."""
-        from fluxvla_core.training import left_out
+        from fluxvla_core.training import external_weights
         from fluxvla_deepspeed.engine import start
 
         inner = super()._build_optimizer()
@@ -87,7 +87,7 @@ class DeepSpeedTrainRunner(BaseTrainRunner):
         names = {id(p): name for name, p in model.named_parameters()}
         self._groups = [[names[id(p)] for p in g["params"]] for g in inner.param_groups]
         # Stage 3 splits frozen weights as well: so they are hashed before that.
-        self.left_out = left_out(model)
+        self.external_weights = external_weights(model)
         self.vla = start(
             model, inner, self.zero_stage, self.max_grad_norm, self.compute_dtype, self.world
         )

@@ -17,9 +17,9 @@ from fluxvla_models.lerobot_files import (
     PREPROCESSOR,
     Step,
     check_policy_settings,
+    full_tensor,
     policy_type,
     read_steps,
-    whole,
 )
 
 from fluxvla_core.errors import CheckpointError
@@ -232,7 +232,7 @@ def _robot(
         tables = pack["modality_config"], pack["raw_stats"]
         robot = grouped_robot(tag, number, *tables, settings, where)
     else:
-        found = {name: whole(stored).tolist() for name, stored in packing.tensors.items()}
+        found = {name: full_tensor(stored).tolist() for name, stored in packing.tensors.items()}
         robot = flat_robot(tag, number, found, where)
     trained = pack.get("valid_action_horizon")
     horizon = trained if isinstance(trained, int) else robot.horizon

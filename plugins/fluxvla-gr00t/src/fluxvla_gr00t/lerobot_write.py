@@ -24,7 +24,7 @@ from fluxvla_models.lerobot_files import (
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
-    whole,
+    full_tensor,
     write_steps,
 )
 from safetensors.torch import save_file
@@ -304,7 +304,7 @@ def _n17_steps(checkpoint: ForeignCheckpoint, facts: Facts) -> tuple[list[Step],
 def _tensors(checkpoint: ForeignCheckpoint, version: str) -> dict[str, Tensor]:
     """All weights under LeRobot's names, with those that nothing reads."""
     tensors = {
-        published_name(name, version): whole(tensor).contiguous()
+        published_name(name, version): full_tensor(tensor).contiguous()
         for name, tensor in checkpoint.tensors.items()
     }
     if version == "n1.7":

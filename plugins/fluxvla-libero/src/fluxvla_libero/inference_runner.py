@@ -58,7 +58,7 @@ class LiberoInferenceRunner:
         cfg: the whole config (injected).
         context: what the run knows (injected): work dir, task, reporter.
         seed: of the policy, with that of the initial state added.
-        ckpt_path: checkpoint or work dir; the newest whole one of the work dir by default.
+        ckpt_path: checkpoint or work dir; the newest undamaged one of the work dir by default.
         task_suite_name: whose scenes.
         scene: index or name of the task whose scene it is; by default that of the instruction.
         init_state: which of the scene's 50 fixed states it begins in.

@@ -167,7 +167,7 @@ def write_steps(
     (folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
 
 
-def whole(stored: Stored | Tensor) -> Tensor:
+def full_tensor(stored: Stored | Tensor) -> Tensor:
     """The tensor that ``stored`` stands for."""
     if isinstance(stored, Tensor):
         return stored

@@ -26,8 +26,8 @@ from fluxvla_models.lerobot_files import (
     PREPROCESSOR,
     STATE,
     check_both,
+    full_tensor,
     read_steps,
-    whole,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -224,4 +224,4 @@ def _table(values: Mapping[str, Any], name: str, where: Path) -> Mapping[str, An
 
 
 def _array(stored: Stored) -> Floats:
-    return np.asarray(whole(stored).double().numpy())
+    return np.asarray(full_tensor(stored).double().numpy())

@@ -33,7 +33,7 @@ from fluxvla_models.lerobot_files import (
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
-    whole,
+    full_tensor,
     write_steps,
 )
 from fluxvla_models.lerobot_names import published_act_name, published_diffusion_name
@@ -99,7 +99,7 @@ def write_act(checkpoint: ForeignCheckpoint, folder: Path) -> None:
             "kl_weight",
         ),
     }
-    tensors = {published_act_name(name): whole(t) for name, t in checkpoint.tensors.items()}
+    tensors = {published_act_name(name): full_tensor(t) for name, t in checkpoint.tensors.items()}
     if model["use_vae"]:  # the place of the class token, the state and each action
         table = positions_1d(model["horizon"] + 2, model["dim_model"], torch.device("cpu"))
         tensors["model.vae_encoder_pos_enc"] = table
@@ -147,7 +147,8 @@ def write_diffusion(checkpoint: ForeignCheckpoint, folder: Path) -> None:
     }
     separate = bool(model["separate_encoders"])
     tensors = {
-        published_diffusion_name(name, separate): whole(t) for name, t in checkpoint.tensors.items()
+        published_diffusion_name(name, separate): full_tensor(t)
+        for name, t in checkpoint.tensors.items()
     }
     seen = model["crop_shape"] or model["resize_shape"] or prepared.size
     grid = position_grid(*(-(-int(side) // _STRIDE) for side in seen))

@@ -128,7 +128,7 @@ class OpenVLAFormat(CheckpointFormat):
 
     def write(self, checkpoint: ForeignCheckpoint, folder: Path) -> None:
         """Write Hugging Face's layout, OpenVLA-OFT's own files, and what they do not say."""
-        tensors = {name: whole(value) for name, value in checkpoint.tensors.items()}
+        tensors = {name: full_tensor(value) for name, value in checkpoint.tensors.items()}
         film = bool(checkpoint.model.get("use_film"))
         parts: dict[str, dict[str, Tensor]] = {}
         base: dict[str, Tensor] = {}
@@ -218,7 +218,7 @@ def tokenizer_path(folder: Path, given: str | None) -> str:
     )
 
 
-def whole(value: Tensor | Stored) -> Tensor:
+def full_tensor(value: Tensor | Stored) -> Tensor:
     """All of a tensor that may still be in its file."""
     if isinstance(value, Stored):
         return value[tuple(slice(0, length) for length in value.shape)]

@@ -19,7 +19,7 @@ from fluxvla_core.errors import CheckpointError
 from fluxvla_core.models import ForeignCheckpoint
 from fluxvla_core.results import read_json
 from fluxvla_pi.action_tokens import ActionWords
-from fluxvla_pi.lerobot_format import write_policy
+from fluxvla_pi.lerobot_write import write_policy
 from fluxvla_pi.published import FAST, only, table_of
 
 TOKENIZER = "lerobot/fast-action-tokenizer"

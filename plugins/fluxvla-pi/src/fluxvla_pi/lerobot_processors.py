@@ -20,8 +20,8 @@ from fluxvla_models.lerobot_files import (
     STATE,
     Step,
     check_both,
+    full_tensor,
     read_steps,
-    whole,
     write_steps,
 )
 
@@ -292,7 +292,7 @@ def _rows(
         stored = tensors.get(prefix + name)
         if stored is None:
             continue
-        row = whole(stored).float()
+        row = full_tensor(stored).float()
         if row.shape != (width,):
             raise CheckpointError(
                 f"{prefix}{name} has shape {tuple(row.shape)}, {width} numbers are expected",

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fluxvla_models.lerobot_files import whole
+from fluxvla_models.lerobot_files import full_tensor
 from torch import Tensor, nn
 
 from fluxvla_core.errors import CheckpointError
@@ -179,8 +179,8 @@ def family_of(checkpoint: ForeignCheckpoint) -> str:
 def weights_to_write(checkpoint: ForeignCheckpoint, layout: Layout) -> dict[str, Tensor]:
     """The weights under the names of ``layout``, and what nothing uses as zeros."""
     names = published(list(checkpoint.tensors), layout)
-    found = {theirs: whole(checkpoint.tensors[ours]) for theirs, ours in names.items()}
-    embedding = whole(checkpoint.tensors["llm_backbone.embed_tokens.weight"])
+    found = {theirs: full_tensor(checkpoint.tensors[ours]) for theirs, ours in names.items()}
+    embedding = full_tensor(checkpoint.tensors["llm_backbone.embed_tokens.weight"])
     expert = checkpoint.tensors.get("action_in_proj.weight")
     for name in layout.unused if expert is not None else ():
         found[name] = torch.zeros(len(embedding), expert.shape[0], dtype=embedding.dtype)

@@ -83,7 +83,12 @@ def _events(reader: Reader, folder: Path) -> Sequence[Event]:
 
 def _notes(summary: Mapping[str, Any], start: Event) -> dict[str, Any]:
     began = start.get("began")
-    dropped = {k: v for k, v in (summary.get("dropped") or {}).items() if v}
+    # Version 0.1 wrote the keys on the right.
+    dropped = {
+        {"pictures": "images"}.get(kind, kind): count
+        for kind, count in (summary.get("dropped") or {}).items()
+        if count
+    }
     return {
         "began": datetime.fromtimestamp(began, timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
         if isinstance(began, (int, float))
@@ -94,8 +99,8 @@ def _notes(summary: Mapping[str, Any], start: Event) -> dict[str, Any]:
         "rate": f"{summary['rate_hz']:g} Hz" if summary.get("rate_hz") else None,
         "chunks of the policy": summary.get("chunks"),
         "seed": summary.get("seed"),
-        "control ticks skipped": summary.get("skipped_beats"),
-        "control ticks without a chunk, held": summary.get("held_beats"),
+        "control ticks skipped": summary.get("skipped_ticks", summary.get("skipped_beats")),
+        "control ticks without a chunk, held": summary.get("held_ticks", summary.get("held_beats")),
         "trips": _trips(summary.get("trips", [])),
         "clamped commands": clamp_counts(summary.get("clamps")),
         "commands without a late filter": _late_filters(summary.get("late_filters")),

@@ -19,8 +19,8 @@ from fluxvla_models.lerobot_files import (
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
+    full_tensor,
     read_steps,
-    whole,
 )
 
 from fluxvla_core.errors import CheckpointError
@@ -139,7 +139,7 @@ def buffered_statistics(tensors: Mapping[str, Stored]) -> Statistics:
     for name in tensors:
         for prefix, feature in _BUFFERS.items():
             if name.startswith(prefix):
-                values = whole(tensors[name]).float()
+                values = full_tensor(tensors[name]).float()
                 # Infinite where nothing was ever set.
                 if values.isfinite().all():
                     found.setdefault(feature, {})[name.removeprefix(prefix)] = values.tolist()
@@ -180,5 +180,5 @@ def _statistics(tensors: Mapping[str, Stored]) -> Statistics:
     for name, stored in tensors.items():
         feature, _, statistic = name.rpartition(".")
         if feature in (STATE, ACTION) and statistic != "count":
-            found.setdefault(feature, {})[statistic] = whole(stored).float().tolist()
+            found.setdefault(feature, {})[statistic] = full_tensor(stored).float().tolist()
     return found

@@ -14,7 +14,7 @@ from fluxvla_models.lerobot_files import (
     POSTPROCESSOR,
     PREPROCESSOR,
     STATE,
-    whole,
+    full_tensor,
     write_steps,
 )
 from safetensors.torch import save_file
@@ -63,7 +63,7 @@ def write(checkpoint: ForeignCheckpoint, folder: Path) -> None:
     config = _config(checkpoint, transforms, statistics)
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
     names = published_names(checkpoint.tensors)
-    tensors = {theirs: whole(checkpoint.tensors[ours]) for ours, theirs in names.items()}
+    tensors = {theirs: full_tensor(checkpoint.tensors[ours]) for ours, theirs in names.items()}
     save_file(
         {name: tensor.contiguous() for name, tensor in tensors.items()},
         folder / "model.safetensors",

@@ -79,7 +79,8 @@ class URRTDEOperator(Operator):
         gain: of ``servoJ``, 100 to 2000.
         watchdog_hz: the controller stops the arm when it hears less often than this.
         connect_timeout_s: how long ``connect`` waits for each part of the robot.
-        max_age_s: a stream whose last reading is older is silent, and no frame is made.
+        max_age_s: how long a stream may be silent, checked at every command. Not
+            ``safety.max_age_s``: how old an observation may be when the policy is queried.
 
     Raises:
         ConfigError: an unknown model, or a value out of its range.

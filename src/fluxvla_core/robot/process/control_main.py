@@ -1,7 +1,7 @@
-"""The control process: commands the robot, and asks the main process for chunks.
+"""The control process: commands the robot, and queries the policy through the main process.
 
-It runs the same episodes as a run in one process; where those ask the policy, look at a signal or
-report something, the classes here ask the main process over the link, and never wait for it while
+It runs the same episodes as a run in one process; where those query the policy, look at a signal or
+report something, the classes here send a message to the main process, and never wait for it while
 an arm moves.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control import realtime
-from fluxvla_core.control.interrupt import Interrupted, what_became
+from fluxvla_core.control.interrupt import Interrupted, stop_outcome
 from fluxvla_core.control.joiners import make_joiner
 from fluxvla_core.control.safety import Latch
 from fluxvla_core.control.sender import ExecuteActions
@@ -37,7 +37,7 @@ from fluxvla_core.robot.events import (
     EpisodeEnded,
     EpisodeObserver,
     Event,
-    FilterLeftOut,
+    FilterSkipped,
     Phase,
     Stopped,
 )
@@ -103,9 +103,28 @@ class LinkObserver(EpisodeObserver):
     def __init__(self, link: Link, inbox: Inbox) -> None:
         self._link, self._inbox = link, inbox
         self._commands = 0
-        self._newest: deque[CommandSent | FilterLeftOut | Stopped | EpisodeEnded] = deque(
+        self._newest: deque[CommandSent | FilterSkipped | Stopped | EpisodeEnded] = deque(
             maxlen=_EVENTS_KEPT
         )
+        self._folder: Path | None = None
+        self._in_episode = False
+
+    def begin(self, folder: Path) -> None:
+        """An episode begins; ``folder`` has its record."""
+        self._newest.clear()
+        self._folder, self._in_episode = folder, True
+
+    def end(self) -> None:
+        """The episode is over; whatever was sent of it may not have been read yet."""
+        self._in_episode = self._inbox.orphaned
+
+    def unread(self) -> tuple[bool, str | None]:
+        """Whether the main process has not taken all that it was sent of the last episode, and what
+        ended that early; None of an episode that only its death ended."""
+        if self._in_episode:
+            return True, None
+        ended = (e.problem for e in reversed(self._newest) if isinstance(e, EpisodeEnded))
+        return (False, None) if self._link.read_by_other else (True, next(ended, None))
 
     def on_event(self, event: Event) -> None:
         if isinstance(event, CommandSent):
@@ -113,7 +132,7 @@ class LinkObserver(EpisodeObserver):
             self._commands += 1
             if self._commands % _COMMANDS_PER_COLLECTION == 0:
                 gc.collect(1)
-        if isinstance(event, (CommandSent, FilterLeftOut, Stopped, EpisodeEnded)):
+        if isinstance(event, (CommandSent, FilterSkipped, Stopped, EpisodeEnded)):
             self._newest.append(event)
         message = event_message(event)
         if message is not None:
@@ -121,7 +140,7 @@ class LinkObserver(EpisodeObserver):
             send = self._link.try_send if isinstance(event, CommandSent) else self._link.send
             send(message.kind, message.arrays, **message.fields)
 
-    def write_rest(self, folder: Path) -> None:
+    def write_rest(self) -> None:
         """Write what the main process, which is dead, did not; the robot was stopped.
 
         Raises:
@@ -129,7 +148,9 @@ class LinkObserver(EpisodeObserver):
         """
         from fluxvla_core.robot.recording.trace import REST_FILE, JsonLines  # rarely needed
 
-        file = JsonLines(folder, REST_FILE)
+        if self._folder is None:
+            return
+        file = JsonLines(self._folder, REST_FILE)
         for event in self._newest:
             file.add(logged(event))
         file.close()
@@ -155,7 +176,7 @@ def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = 
     if isinstance(robot, UndividedRobot):
         assert frame_channel is not None, "the main process shares memory for its images"
         robot.serve(frame_channel, setup.cameras or (), setup.settings.safety.max_age_s)
-        inbox.watch = robot.check_reading
+        inbox.watch = robot.check_frame_time
     observer = LinkObserver(link, inbox)
     parts = _parts(link, setup, robot, execute_actions, inbox, reporter, observer)
     history = RunHistory(commanded=None if setup.before is None else np.asarray(setup.before))
@@ -178,10 +199,12 @@ def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = 
                 else:
                     _carry_out(link, inbox, engine, observer, order)
     finally:
+        unread, problem = observer.unread()
         failures = [engine.stop(), engine.close()]
         link.send(Kind.CLOSED, failures=failures)
         if inbox.orphaned:
-            _report_orphaned(engine, failures)
+            lost = _complete_record(observer) if unread else None
+            _report_orphaned(engine, failures, problem, lost)
 
 
 def _outlive_main(inbox: Inbox) -> None:
@@ -192,14 +215,36 @@ def _outlive_main(inbox: Inbox) -> None:
     os._exit(EXIT_FAILED)
 
 
-def _report_orphaned(engine: Engine, failures: Sequence[str | None]) -> None:
-    """Print what became of the robot: there is no other process that could."""
+def _complete_record(observer: LinkObserver) -> OSError | None:
+    try:
+        observer.write_rest()
+    except OSError as error:
+        return error
+    return None
+
+
+def _report_orphaned(
+    engine: Engine,
+    failures: Sequence[str | None],
+    problem: str | None = None,
+    lost: OSError | None = None,
+) -> None:
+    """Print what became of the robot: there is no other process that could.
+
+    Args:
+        problem: what had stopped the arm, if the main process was frozen by then.
+        lost: why the episode's record is not complete.
+    """
+    before = f" (before that: {problem})" if problem else ""
     # A stop that failed at the episode's end fails again.
     trouble = "; ".join(dict.fromkeys(text for text in (engine.stop_failure, *failures) if text))
     with suppress(OSError):  # The terminal may be gone, too.
         print(
-            f"fluxvla: the main process was killed; {what_became(trouble or None)}", file=sys.stderr
+            f"fluxvla: the main process was killed{before}; {stop_outcome(trouble or None)}",
+            file=sys.stderr,
         )
+        if lost is not None:
+            print(f"fluxvla: the record is not complete: {lost}", file=sys.stderr)
 
 
 def _wait(link: Link, inbox: Inbox, engine: Engine) -> None:
@@ -248,14 +293,14 @@ def _connect(engine: Engine) -> None:
 
 def _run_episode(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:
     inbox.phase = Phase.START
+    observer.begin(Path(order["folder"]))
     try:
         task = Task(order["task"], order["instruction"], order["free"])
         engine.run_episode(task, order["number"], order["seed"], (observer,), Path(order["folder"]))
     finally:
         inbox.phase = Phase.OVER
         gc.collect()
-        if inbox.orphaned:
-            observer.write_rest(Path(order["folder"]))
+        observer.end()
 
 
 def _parts(
@@ -274,14 +319,14 @@ def _parts(
     ) -> RemotePolicyClient:
         return RemotePolicyClient(link, inbox, robot, patience_s)
 
-    def left_out(name: str) -> None:
-        observer.on_event(FilterLeftOut(robot.clock.now(), name))
+    def on_skipped(name: str) -> None:
+        observer.on_event(FilterSkipped(robot.clock.now(), name))
 
     made = setup.make_filters(reporter)
     return EpisodeParts(
         robot=robot,
         make_client=make_client,
-        filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, left_out),
+        filters=timed_filters(made, setup.settings.rate_hz, reporter.warn, on_skipped),
         joiner=make_joiner(*setup.joining),
         execute_actions=execute_actions,
         latch=Latch(robot.clock.now),

@@ -1,7 +1,7 @@
 """``FrameChannel``: an operator's frames on their way from the control process to the main process.
 
-There is one frame at a time, and only where the main process asked for one: what is asked for is
-written while nobody reads, and read while nobody writes. A question, and its answer, is a number in
+There is one frame at a time, and only where the main process requested one: what is requested is
+written while nobody reads, and read while nobody writes. A request, and its answer, is a number in
 shared memory and then a signal of an ``eventfd``; that system call also orders the memory's
 contents, whatever the order is in which a processor sees the stores. Nothing is pickled: a frame is
 JSON values and arrays of numbers.
@@ -37,10 +37,10 @@ _MORE, _MEASURED = "more ", "measured"
 
 
 class FrameMemory(NamedTuple):
-    """File descriptors: of the shared memory, and of the events 'asked' and 'answered'."""
+    """File descriptors: of the shared memory, and of the events 'requested' and 'answered'."""
 
     memory: int
-    asked: int
+    requested: int
     answered: int
 
     def close(self) -> None:
@@ -102,10 +102,10 @@ class FrameChannel:
 
     # The main process's end.
 
-    def ask(self) -> None:
-        """Ask for a frame; the one before was taken, or nobody waits for it any more."""
+    def request(self) -> None:
+        """Request a frame; the one before was taken, or nobody waits for it any more."""
         self._numbers[_ASKED] += 1
-        os.eventfd_write(self._descriptors.asked, 1)
+        os.eventfd_write(self._descriptors.requested, 1)
 
     def answered(self, seconds: float) -> bool:
         """Wait for the answer; whether it came within so many seconds."""
@@ -127,9 +127,9 @@ class FrameChannel:
 
     # The control process's end.
 
-    def wait_for_question(self) -> None:
-        """Wait until a frame is asked for."""
-        os.eventfd_read(self._descriptors.asked)
+    def wait_for_request(self) -> None:
+        """Wait until a frame is requested."""
+        os.eventfd_read(self._descriptors.requested)
 
     def fits(self, message: FrameMessage) -> bool:
         """Whether there is room for it."""
@@ -138,7 +138,7 @@ class FrameChannel:
         )
 
     def answer(self, message: FrameMessage) -> None:
-        """Answer the question; ``message`` fits."""
+        """Answer the request; ``message`` fits."""
         text = _text(message)
         self._numbers[_LENGTH] = len(text)
         self._data[: len(text)] = np.frombuffer(text, np.uint8)
@@ -157,7 +157,7 @@ def message_of_frame(frame: Frame, cameras: Iterable[str], source: str) -> Frame
 
     Args:
         frame: of the operator; an image that is None has not come yet.
-        cameras: the ones that are asked for.
+        cameras: the requested ones.
         source: what gave it, for messages.
 
     Raises:
@@ -198,7 +198,7 @@ def message_of_observation(
         window: ``qpos`` and ``images``; None for what has not come yet. What else it has is arrays
             of numbers or JSON values.
         frame: that it was made of, where the operator has frames: state and stamps are sent.
-        cameras: the ones that are asked for.
+        cameras: the requested ones.
         source: what gave it, for messages.
 
     Raises:

@@ -20,7 +20,7 @@ from fluxvla_core.robot.process.messages import Kind, Message, error_of
 
 @dataclass(frozen=True)
 class RemoteAnswer(Answer):
-    """An answer of the main process; ``number`` is its question's."""
+    """An answer of the main process; ``number`` is its query's."""
 
     number: int
 

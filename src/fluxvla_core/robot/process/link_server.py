@@ -23,7 +23,7 @@ _WATCH_S = 0.02
 
 
 class LinkServer:
-    """Shows that this process runs, answers questions about chunks, and watches the cameras.
+    """Shows that this process runs, answers queries, and watches the cameras.
 
     In a thread of its own: whatever an observer, a hook or a person at the terminal does with the
     main thread, the control process is served.
@@ -35,7 +35,7 @@ class LinkServer:
 
     Attributes:
         messages: what came that is for the main thread.
-        answers: number of a question -> the policy's answer that was sent.
+        answers: number of a query -> the policy's answer that was sent.
         raised: what was raised here and sent; it has a traceback.
         phase: of the episode, as far as the main thread knows.
     """
@@ -79,7 +79,7 @@ class LinkServer:
         self._thread.join()
 
     def _serve(self) -> None:
-        """Show that this process runs, answer questions, and watch the cameras."""
+        """Show that this process runs, answer queries, and watch the cameras."""
         realtime.raise_priority()
         watched = 0.0
         ended = False
@@ -89,7 +89,7 @@ class LinkServer:
             self._link.flush()
             self._pass_signals_on()
             while (message := self._link.receive()) is not None:
-                if message.kind == Kind.ASK:
+                if message.kind == Kind.QUERY:
                     self._ask(message)
                 elif message.kind == Kind.LATE:
                     self._reply_delay(message["since"])
@@ -129,7 +129,7 @@ class LinkServer:
                 arrays = (answer.checked(),)
                 self._link.send(Kind.ANSWER, arrays, number=number, observed=answer.observed)
 
-        client.ask(previous_chunk_of(message)).add_done_callback(answered)
+        client.query(previous_chunk_of(message)).add_done_callback(answered)
 
     def _reply_delay(self, since: float) -> None:
         late, seconds = self._robot.delays.longest(since)
@@ -143,7 +143,7 @@ class LinkServer:
         )
 
     def _watch_cameras(self) -> None:
-        """A camera that falls silent stops the arm before the next question."""
+        """A camera that falls silent stops the arm before the next query."""
         try:
             self._robot.state()
         except FluxError as error:

@@ -27,7 +27,7 @@ from fluxvla_core.robot.events import (
     CommandSent,
     EpisodeEnded,
     Event,
-    FilterLeftOut,
+    FilterSkipped,
     Phase,
     Stopped,
     StoppedWhileHeld,
@@ -61,7 +61,7 @@ class Kind(str, Enum):
 
     # Main process -> control process: taken at every tick, also while an order is carried out.
     ANSWER = "answer"
-    """To ASK: ``number``, and ``observed`` with the actions or with ``refused``, or an error."""
+    """To QUERY: ``number``, and ``observed`` with the actions or with ``refused``, or an error."""
     REPLY = "reply"
     """To FIRST_STATE, RESET or LATE, which ``to`` names."""
     SIGNAL = "signal"
@@ -82,13 +82,13 @@ class Kind(str, Enum):
     RELEASED = "released"
     """The hold between two episodes ended: an error."""
 
-    # Control process -> main process: questions of an episode.
+    # Control process -> main process: requests of an episode.
     FIRST_STATE = "first state"
-    """Wait for the first reading; REPLY has its state."""
+    """Wait for the first observation; REPLY has its state."""
     RESET = "reset"
     """Reset the policy; REPLY follows."""
-    ASK = "ask"
-    """Observe, and ask the policy: ``number``, and the chunk to continue; ANSWER follows."""
+    QUERY = "query"
+    """Observe, and query the policy: ``number``, and the chunk to continue; ANSWER follows."""
     ACCEPTED = "accepted"
     """The chunk of ANSWER ``number`` is executed."""
     REFUSED = "refused"
@@ -108,7 +108,7 @@ class Kind(str, Enum):
 
     # Control process -> main process: events of the episode, see ``event_message``.
     COMMAND = "command"
-    FILTER_LEFT_OUT = "filter left out"
+    FILTER_SKIPPED = "filter skipped"
     STOPPED = "stopped"
     STOPPED_WHILE_HELD = "stopped while held"
     ENDED = "ended"
@@ -197,8 +197,8 @@ def event_message(event: Event) -> Message | None:
             }
             arrays = (sent.target, sent.command)
             return Message(Kind.COMMAND, fields, arrays if state is None else (*arrays, state))
-        case FilterLeftOut():
-            return Message(Kind.FILTER_LEFT_OUT, vars(event))
+        case FilterSkipped():
+            return Message(Kind.FILTER_SKIPPED, vars(event))
         case Stopped():
             return Message(Kind.STOPPED, vars(event))
         case StoppedWhileHeld(at, trip, failure):
@@ -225,8 +225,8 @@ def event_of(message: Message) -> Event | None:
                 fields["send_s"],
                 fields["late_s"],
             )
-        case Kind.FILTER_LEFT_OUT:
-            return FilterLeftOut(**fields)
+        case Kind.FILTER_SKIPPED:
+            return FilterSkipped(**fields)
         case Kind.STOPPED:
             return Stopped(**fields)
         case Kind.STOPPED_WHILE_HELD:

@@ -321,7 +321,7 @@ class RemoteEngine(Engine):
     @property
     def _episode_client(self) -> PolicyClient:
         client = self._process.server.client
-        assert client is not None, "the control process asks in an episode only"
+        assert client is not None, "the control process sends queries in an episode only"
         return client
 
     def _reply(self, to: str, answer: Callable[[], Any]) -> None:

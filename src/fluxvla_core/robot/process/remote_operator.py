@@ -39,7 +39,7 @@ class RemoteOperator(Operator):
     def __init__(self, name: str, embodiment: EmbodimentSpec, domain_id: int | None = None) -> None:
         self.name, self._embodiment, self._domain_id = name, embodiment, domain_id
         self._channel: FrameChannel | None = None
-        # One who asks at a time.
+        # One request at a time.
         self._lock = threading.Lock()
 
     @property
@@ -54,7 +54,7 @@ class RemoteOperator(Operator):
         """The descriptors that a new control process is to have; this end keeps its own.
 
         Args:
-            cameras: names of the cameras whose images are asked for.
+            cameras: names of the cameras whose images are requested.
 
         Raises:
             OSError: the system has no room for it.
@@ -67,7 +67,7 @@ class RemoteOperator(Operator):
         """The control process connects to the robot."""
 
     def get_frame(self) -> Frame:
-        """The newest reading, read in the control process for this call.
+        """The newest frame, read in the control process for this call.
 
         Raises:
             NotReady: the control process does not run.
@@ -80,12 +80,12 @@ class RemoteOperator(Operator):
         return observation_of(self.read_frame_message())
 
     def read_frame_message(self) -> FrameMessage:
-        """Ask the control process for one reading of the robot; raises as ``get_frame``."""
+        """Request one frame or observation from the control process; raises as ``get_frame``."""
         with self._lock:
             channel = self._channel
             if channel is None:
                 raise self._gone()
-            channel.ask()
+            channel.request()
             while not channel.answered(_POLL_S):
                 if self._channel is not channel:
                     raise self._gone()

@@ -1,4 +1,4 @@
-"""``RemotePolicyClient``: asks the policy in the main process, from the control process."""
+"""``RemotePolicyClient``: queries the policy in the main process, from the control process."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LINK = DelaySource(
 
 
 class RemotePolicyClient(PolicyClient):
-    """Asks the policy in the main process, for one episode.
+    """Queries the policy in the main process, for one episode.
 
     Args:
         link: the control process's end.
@@ -38,7 +38,7 @@ class RemotePolicyClient(PolicyClient):
     def __init__(self, link: Link, inbox: Inbox, robot: Robot, patience_s: float) -> None:
         self._link, self._inbox, self._robot = link, inbox, robot
         self._patience_s = patience_s
-        self._asked = 0
+        self._queries = 0
 
     def first_state(self) -> Array:
         # The main process gives the robot its time, and says so if that was not enough.
@@ -47,12 +47,12 @@ class RemotePolicyClient(PolicyClient):
     def reset(self) -> None:
         self._request(Kind.RESET, self._patience_s)
 
-    def ask(self, previous: PreviousChunk | None) -> Future[Answer]:
-        self._asked += 1
+    def query(self, previous: PreviousChunk | None) -> Future[Answer]:
+        self._queries += 1
         future: Future[Answer] = Future()
-        self._inbox.answers[self._asked] = future
+        self._inbox.answers[self._queries] = future
         fields, arrays = _previous_fields(previous)
-        self._link.send(Kind.ASK, arrays, number=self._asked, **fields)
+        self._link.send(Kind.QUERY, arrays, number=self._queries, **fields)
         return future
 
     def accepted(self, answer: Answer) -> None:
@@ -111,7 +111,7 @@ def _previous_fields(previous: PreviousChunk | None) -> tuple[dict[str, Any], tu
 
 
 def previous_chunk_of(message: Message) -> PreviousChunk | None:
-    """The chunk in a message ``ASK``, which the policy has to continue."""
+    """The chunk in a message ``QUERY``, which the policy has to continue."""
     if not message.arrays:
         return None
     actions, anchor = message.arrays

@@ -39,7 +39,7 @@ def timed_filters(
     filters: Sequence[ActionFilter],
     rate_hz: float,
     warn: Callable[[str], None],
-    left_out: Callable[[str], None],
+    on_skipped: Callable[[str], None],
 ) -> list[ActionFilter]:
     """``filters`` in their order, those that are not known to be quick within a time limit.
 
@@ -52,12 +52,12 @@ def timed_filters(
         filters: bound to the robot.
         rate_hz: commands a second.
         warn: called with a message for people, once an episode for each filter that was late.
-        left_out: called with a filter's name for each command that is made without it.
+        on_skipped: called with a filter's name for each command that is made without it.
     """
     quick = [_is_quick(type(each)) for each in filters]
     share_s = SHARE / rate_hz / max(quick.count(False), 1)
     return [
-        each if is_quick else TimedFilter(each, share_s, warn, left_out)
+        each if is_quick else TimedFilter(each, share_s, warn, on_skipped)
         for each, is_quick in zip(filters, quick, strict=True)
     ]
 
@@ -80,7 +80,7 @@ class TimedFilter(ActionFilter):
         inner: the filter; bound to the robot.
         share_s: what it may take, in seconds.
         warn: called with a message for people, once an episode.
-        left_out: called with its name for each command that is made without it.
+        on_skipped: called with its name for each command that is made without it.
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class TimedFilter(ActionFilter):
         inner: ActionFilter,
         share_s: float,
         warn: Callable[[str], None],
-        left_out: Callable[[str], None],
+        on_skipped: Callable[[str], None],
     ) -> None:
         self.name = type(inner).__name__
         self._inner, self._share_s = inner, share_s
-        self._warn, self._left_out = warn, left_out
+        self._warn, self._on_skipped = warn, on_skipped
         self._work: queue.SimpleQueue[Callable[[], Array | None]] = queue.SimpleQueue()
         self._results: queue.SimpleQueue[_Result] = queue.SimpleQueue()
         # Whether the thread was given something that it did not give back.
@@ -170,7 +170,7 @@ class TimedFilter(ActionFilter):
             FilterLate: it was so too often.
         """
         self._late += 1
-        self._left_out(self.name)
+        self._on_skipped(self.name)
         took = f"did not return within {self._share_s * 1e3:.3g} ms"
         if self._late >= MOST_LATE:
             raise FilterLate(

@@ -25,7 +25,7 @@ from fluxvla_core.spec import EmbodimentSpec
 
 
 class UndividedRobot(Robot):
-    """A robot that is not divided; the main process asks for its frames.
+    """A robot that is not divided; the main process requests its frames.
 
     They are read in a thread of its own: a camera that keeps ``get_frame`` waiting delays no
     command. Code in there that holds the GIL does.
@@ -61,7 +61,7 @@ class UndividedRobot(Robot):
 
         def answer() -> None:
             while True:
-                channel.wait_for_question()
+                channel.wait_for_request()
                 self._began = time.monotonic()
                 message = self._read_message(channel)
                 self._began = None
@@ -69,8 +69,8 @@ class UndividedRobot(Robot):
 
         threading.Thread(target=answer, name="fluxvla-frames", daemon=True).start()
 
-    def check_reading(self) -> None:
-        """See that ``get_frame`` returns in time; asked at every command while the arm moves.
+    def check_frame_time(self) -> None:
+        """Raise an error if ``get_frame`` takes too long; called at every command in motion.
 
         Raises:
             BadTiming: it does not: what it will give is old.

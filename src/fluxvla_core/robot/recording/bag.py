@@ -1,4 +1,4 @@
-"""MCAP files: ``Bag`` writes an episode as a rosbag2, ``McapFile`` reads one, whole or cut short.
+"""MCAP files: ``Bag`` writes an episode as a rosbag2; ``McapFile`` reads one, also one cut short.
 
 A process that is killed leaves no index at the end of its file. What it wrote until then is a
 sequence of whole records, and this reads records, so that nothing of it is lost. Format:
@@ -139,12 +139,12 @@ class McapFile:
     Args:
         path: the file.
 
-    ``whole`` is set by going through ``entries`` to their end: whether the file was finished.
+    ``finished`` is set by going through ``entries`` to their end: whether the file was finished.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.whole = False
+        self.finished = False
         self._chunk = lru_cache(maxsize=_KEPT_CHUNKS)(self._read_chunk)
 
     def entries(self) -> Iterator[Entry]:
@@ -153,7 +153,7 @@ class McapFile:
         Raises:
             DataError: this is no MCAP file, or it is damaged before its end.
         """
-        self.whole = False
+        self.finished = False
         channels: dict[int, tuple[str, str]] = {}
         schemas: dict[int, str] = {}
         with self._opened() as file:
@@ -166,7 +166,7 @@ class McapFile:
                 if len(head) < 9 or file.tell() + _length(head) > size:
                     return  # cut short: what is here is no whole record
                 if head[0] == _FOOTER:
-                    self.whole = True
+                    self.finished = True
                     return
                 if head[0] != _CHUNK:
                     file.seek(_length(head), 1)

@@ -60,11 +60,11 @@ START, OBSERVATION, CHUNK, REFUSED = "start", "observation", "chunk", "refused"
 COMMAND, FILTER, STOP, END = "command", "filter", "stop", "end"
 """Values of an event's ``event``.
 
-``start``: what runs on what (the first event); ``observation``: a reading that was looked at;
-``chunk``: a policy's answer that was admitted; ``refused``: a reading or an answer that was not;
-``command``: what was sent; ``filter``: an action filter was late, and is left out of the command
-that comes next; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on the loop's
-clock.
+``start``: what runs on what (the first event); ``observation``: what a query or its history showed;
+``chunk``: a policy's answer that passed its checks; ``refused``: an observation or an answer that
+did not; ``command``: what was sent; ``filter``: an action filter was late, and is left out of the
+command that comes next; ``stop``: a safe stop; ``end``: how it ended. All have ``t``, seconds on
+the loop's clock.
 """
 
 
@@ -157,8 +157,9 @@ class EpisodeSummary:
             "joints": [joint.get("name") for joint in embodiment.get("joints", ())],
             "rate_hz": start.get("rate_hz"),
             "lockstep": start.get("lockstep"),
-            "skipped_beats": end.get("skipped_beats"),
-            "held_beats": self._held,
+            # Version 0.1 wrote ``skipped_beats`` and ``held_beats``.
+            "skipped_ticks": end.get("skipped_ticks", end.get("skipped_beats")),
+            "held_ticks": self._held,
             "clamps": self._clamps,
             "late_filters": self._late_filters,
             "trips": end.get("trips", []),

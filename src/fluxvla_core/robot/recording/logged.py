@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from fluxvla_core.robot.events import CommandSent, EpisodeEnded, FilterLeftOut, Stopped
+from fluxvla_core.robot.events import CommandSent, EpisodeEnded, FilterSkipped, Stopped
 from fluxvla_core.robot.recording import episode_log
 
 
-def logged(event: CommandSent | FilterLeftOut | Stopped | EpisodeEnded) -> dict[str, Any]:
+def logged(event: CommandSent | FilterSkipped | Stopped | EpisodeEnded) -> dict[str, Any]:
     """``event`` as JSON values and arrays."""
     match event:
         case CommandSent(at, sent, phase, state, send_s, late_s):
@@ -30,7 +30,7 @@ def logged(event: CommandSent | FilterLeftOut | Stopped | EpisodeEnded) -> dict[
                 **({"held": True} if sent.held else {}),
                 "ms": milliseconds({k: v for k, v in seconds.items() if v is not None}),
             }
-        case FilterLeftOut(at, name):
+        case FilterSkipped(at, name):
             return {"event": episode_log.FILTER, "t": at, "filter": name}
         case Stopped(at, rule, problem, seconds_, failure):
             return {
@@ -48,7 +48,7 @@ def logged(event: CommandSent | FilterLeftOut | Stopped | EpisodeEnded) -> dict[
                 "outcome": outcome,
                 "success": success,
                 "problem": problem,
-                "skipped_beats": skipped,
+                "skipped_ticks": skipped,
                 "trips": [asdict(trip) for trip in trips],
             }
 

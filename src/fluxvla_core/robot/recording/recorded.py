@@ -83,13 +83,13 @@ class RecordedImages:
         return self._unpack(self._file.read(place), kind)
 
 
-class Recorded:
-    """One episode. ``open_recording`` makes it.
+class RecordedEpisode:
+    """One recorded episode, as ``open_recording`` reads it.
 
     Args:
         path: the episode's folder, or its MCAP file.
         events: in the order in which they happened.
-        whole: whether the record was finished.
+        finished: whether the record was finished.
         images: camera -> its images.
         depths: camera -> its depth images, NaN where nothing was measured.
 
@@ -101,7 +101,7 @@ class Recorded:
         self,
         path: Path,
         events: Sequence[Event],
-        whole: bool,
+        finished: bool,
         images: Mapping[str, RecordedImages],
         depths: Mapping[str, RecordedImages] | None = None,
     ) -> None:
@@ -115,7 +115,7 @@ class Recorded:
         self.events = events
         self.images = images
         self.depths = depths or {}
-        self.whole = whole
+        self.finished = finished
         self.start = events[0]
         if self.start.get("format") != episode_log.FORMAT:
             raise DataError(
@@ -127,8 +127,14 @@ class Recorded:
     @property
     def pictures(self) -> Mapping[str, RecordedImages]:
         """Deprecated name of ``images``."""
-        _renamed("Recorded")
+        _renamed("RecordedEpisode", "pictures", "images")
         return self.images
+
+    @property
+    def whole(self) -> bool:
+        """Deprecated name of ``finished``."""
+        _renamed("RecordedEpisode", "whole", "finished")
+        return self.finished
 
     @property
     def instruction(self) -> str:
@@ -157,7 +163,7 @@ class Recorded:
         return self._rows(found, "command", self.embodiment.dim)
 
     def states(self) -> tuple[Array, Array]:
-        """Times ``(N,)``, ascending, and states ``(N, state_dim)`` of every reading.
+        """Times ``(N,)``, ascending, and states ``(N, state_dim)`` of every observation.
 
         A state that came with images is as old as they are: newer ones may have been read before
         it. Its time is when it arrived; one that was read with a command has the command's.
@@ -190,7 +196,7 @@ class Recorded:
         return episode_log.summarise(self.events)
 
 
-def open_recording(path: str | Path) -> Recorded:
+def open_recording(path: str | Path) -> RecordedEpisode:
     """Read one recorded episode.
 
     Args:
@@ -243,7 +249,7 @@ def bag_of(folder: Path) -> Path | None:
 
 
 def read_lines(path: Path) -> tuple[list[Event], bool]:
-    """The events of a ``trace.jsonl``, and whether it is whole; half a last line is left out.
+    """The events of a ``trace.jsonl``, and whether it is finished; half a last line is left out.
 
     Raises:
         DataError: another line is no event.
@@ -272,17 +278,23 @@ class BagContent:
     @property
     def pictures(self) -> list[tuple[str, str, int, Place]]:
         """Deprecated name of ``images``."""
-        _renamed("BagContent")
+        _renamed("BagContent", "pictures", "images")
         return self.images
 
     @property
-    def whole(self) -> bool:
+    def finished(self) -> bool:
         """Whether it was finished."""
-        return self.file.whole
+        return self.file.finished
+
+    @property
+    def whole(self) -> bool:
+        """Deprecated name of ``finished``."""
+        _renamed("BagContent", "whole", "finished")
+        return self.finished
 
 
 def read_bag(path: Path) -> BagContent:
-    """Go through an MCAP file, whole or cut short.
+    """Go through an MCAP file, finished or cut short.
 
     Raises:
         DataError: it is no MCAP file, or damaged before its end.
@@ -309,22 +321,22 @@ def read_bag(path: Path) -> BagContent:
     return replace(found, offset=offset)
 
 
-def _renamed(owner: str) -> None:
-    message = f"{owner}.pictures is deprecated, use images"
+def _renamed(owner: str, old: str, new: str) -> None:
+    message = f"{owner}.{old} is deprecated, use {new}"
     warnings.warn(message, DeprecationWarning, stacklevel=3)
 
 
-def _read(path: Path) -> Recorded:
+def _read(path: Path) -> RecordedEpisode:
     file = bag_of(path) if path.is_dir() else path
     if file is None:
-        return Recorded(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), images={})
+        return RecordedEpisode(path, *_with_rest(path, *read_lines(path / EVENTS_FILE)), images={})
     bag = read_bag(file)
-    events, whole = _with_rest(file.parent, bag.events, bag.whole)
-    cameras = Recorded(path, events, whole, {}).embodiment.camera_names
+    events, whole = _with_rest(file.parent, bag.events, bag.finished)
+    cameras = RecordedEpisode(path, events, whole, {}).embodiment.camera_names
     colours = {ros.camera_topic(c, kind): c for c in cameras for kind in ros.IMAGE_TYPES}
     images = _sorted(bag, colours, bag.unpacker.image)
     depths = _sorted(bag, {ros.depth_topic(c): c for c in cameras}, bag.unpacker.depth)
-    return Recorded(path, events, whole, images, depths)
+    return RecordedEpisode(path, events, whole, images, depths)
 
 
 def _with_rest(folder: Path, events: list[Event], whole: bool) -> tuple[list[Event], bool]:
@@ -371,7 +383,7 @@ def _arrived(event: Event) -> float:
     return float(event["t"]) - (age_at(event, STATE) if "stamps" in event else 0.0)
 
 
-def check_same_embodiment(recordings: Iterable[Recorded]) -> EmbodimentSpec:
+def check_same_embodiment(recordings: Iterable[RecordedEpisode]) -> EmbodimentSpec:
     """The robot that all of them are of.
 
     Raises:
@@ -405,7 +417,7 @@ def finish_recording(folder: str | Path) -> bool:
     bag = bag_of(place) if place.is_dir() else None
     if bag is None:
         raise DataError("only an episode's folder with a bag can be finished", where=str(place))
-    if recorded.whole and (place / "metadata.yaml").is_file():
+    if recorded.finished and (place / "metadata.yaml").is_file():
         return False
     aside = place.with_name(f".{place.name}.finishing")
     shutil.rmtree(aside, ignore_errors=True)

@@ -22,11 +22,11 @@ from fluxvla_core.robot.events import (
     EpisodeObserver,
     EpisodePrepared,
     Event,
-    FilterLeftOut,
+    FilterSkipped,
+    HistoryObserved,
     Observed,
+    ObservedFrame,
     Refused,
-    Remembered,
-    RobotReading,
     Stopped,
     StoppedWhileHeld,
 )
@@ -74,10 +74,10 @@ class EpisodeRecorder(EpisodeObserver):
             case EpisodePrepared():
                 self._open(event)
             case Observed():
-                self._images = dict(event.reading.observation["images"])
-                self._observed(event.at, event.reading)
-            case Remembered():
-                self._observed(event.at, event.reading)
+                self._images = dict(event.observed.observation["images"])
+                self._observed(event.at, event.observed)
+            case HistoryObserved():
+                self._observed(event.at, event.observed)
             case Refused():
                 self._write(
                     episode_log.REFUSED, event.at, what=event.what, given=_shown(event.values)
@@ -86,7 +86,7 @@ class EpisodeRecorder(EpisodeObserver):
                 self._write(
                     episode_log.CHUNK,
                     event.at,
-                    observed=event.reading.at,
+                    observed=event.observed.at,
                     rate_hz=self.policy.action_rate_hz,
                     keyframes=event.actions,
                     ms=milliseconds(event.stages),
@@ -95,7 +95,7 @@ class EpisodeRecorder(EpisodeObserver):
                 self._commands += 1
                 self._keep(logged(event))
                 self._film()
-            case FilterLeftOut() | Stopped():
+            case FilterSkipped() | Stopped():
                 self._keep(logged(event))
             case EpisodeEnded():
                 self._finish(event)
@@ -134,8 +134,8 @@ class EpisodeRecorder(EpisodeObserver):
             began=time.time(),
         )
 
-    def _observed(self, now: float, reading: RobotReading) -> None:
-        frame, images = reading.frame, reading.observation["images"]
+    def _observed(self, now: float, observed: ObservedFrame) -> None:
+        frame, images = observed.frame, observed.observation["images"]
         seen = images if frame is None else frame.images
         stamps = dict(frame.stamps) if frame is not None else dict.fromkeys((STATE, *images), now)
         for camera, image in seen.items():
@@ -144,10 +144,10 @@ class EpisodeRecorder(EpisodeObserver):
         self._write(
             episode_log.OBSERVATION,
             now,
-            state=reading.state,
+            state=observed.state,
             stamps=stamps,
             **base,
-            ms=milliseconds(reading.seconds),
+            ms=milliseconds(observed.seconds),
         )
 
     def _finish(self, event: EpisodeEnded) -> None:
@@ -160,10 +160,7 @@ class EpisodeRecorder(EpisodeObserver):
         self.summary = self._counted.to_dict()
         try:
             self.summary = self._trace.close(self.summary)
-            # The file's key is older than the word that everything else uses.
-            words = {"pictures": "images"}
-            dropped = self._trace.dropped.items()
-            lost = [f"{count} {words.get(what, what)}" for what, count in dropped if count]
+            lost = [f"{count} {kind}" for kind, count in self._trace.dropped.items() if count]
             if lost:
                 self.reporter.warn(
                     f"{' and '.join(lost)} were not recorded: "

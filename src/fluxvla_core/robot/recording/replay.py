@@ -23,7 +23,7 @@ from fluxvla_core.robot.recording import episode_log
 from fluxvla_core.robot.recording.recorded import (
     ROUNDING_S,
     Event,
-    Recorded,
+    RecordedEpisode,
     age_at,
     newest_at,
     open_recording,
@@ -65,7 +65,7 @@ class ReplayOperator(Operator):
         self._began = 0.0
 
     @cached_property
-    def recorded(self) -> Recorded:
+    def recorded(self) -> RecordedEpisode:
         """The recording, read when it is first needed.
 
         Raises:
@@ -108,7 +108,7 @@ class ReplayOperator(Operator):
             )
 
     def get_frame(self) -> RobotFrame:
-        """The matched readings of this moment; images in new arrays, depth and base if recorded.
+        """The matched state and images of this moment, in new arrays; depth and base if recorded.
 
         Streams are as late, and as far apart, as they were when the robot was looked at last. No
         stream runs backwards: the recorded looks bound what is shown between them.
@@ -158,7 +158,7 @@ class ReplayOperator(Operator):
         over = self._now() >= self._last - ROUNDING_S
         if over and not self._ended:
             self._ended = True
-            cut = "" if self.recorded.whole else ", where it was cut short"
+            cut = "" if self.recorded.finished else ", where it was cut short"
             self._reporter.info(f"the recording {self.recorded.path} ends here{cut}")
         return over
 
@@ -194,7 +194,7 @@ class ReplayOperator(Operator):
         found = sorted(self.recorded.of(episode_log.OBSERVATION), key=lambda event: event["t"])
         if not found:
             raise DataError(
-                "the recording holds no reading of the robot", where=str(self.recorded.path)
+                "the recording holds no observation of the robot", where=str(self.recorded.path)
             )
         return found
 
@@ -266,7 +266,7 @@ class ReplayPolicy(Policy):
         self._next = 0
 
     @cached_property
-    def recorded(self) -> Recorded:
+    def recorded(self) -> RecordedEpisode:
         """The recording, read when it is first needed.
 
         Raises:
@@ -306,7 +306,7 @@ class ReplayPolicy(Policy):
             RecordingEnded: there is none left; a robot's episode ends well with it.
         """
         if self._next >= len(self._chunks):
-            cut = "" if self.recorded.whole else ", where it was cut short"
+            cut = "" if self.recorded.finished else ", where it was cut short"
             text = f"the recording {self.recorded.path} ends here{cut}"
             self._reporter.info(text)
             raise RecordingEnded(text)

@@ -1,4 +1,4 @@
-"""Recorded episodes as a LeRobot v3.0 dataset, to train on what a robot did.
+"""RecordedEpisode episodes as a LeRobot v3.0 dataset, to train on what a robot did.
 
 A row is what was known at its time: the newest state and images that had arrived. Its action is
 the command that the robot had one row later, where the joints were to be by then: demonstrations
@@ -19,7 +19,7 @@ from fluxvla_core.data.writer import LeRobotWriter
 from fluxvla_core.errors import DataError
 from fluxvla_core.robot.recording.recorded import (
     ROUNDING_S,
-    Recorded,
+    RecordedEpisode,
     check_same_embodiment,
     find_recordings,
     newest_at,
@@ -67,7 +67,7 @@ def recordings_to_dataset(
     return Path(out)
 
 
-def row_times(recorded: Recorded, fps: float) -> Array:
+def row_times(recorded: RecordedEpisode, fps: float) -> Array:
     """``(N,)`` times of the rows: from the task's first observation, as long as it was commanded.
 
     The next row's time is not later than the last command's, so that every row has an action.
@@ -82,7 +82,7 @@ def row_times(recorded: Recorded, fps: float) -> Array:
     return times
 
 
-def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[Recorded]:
+def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[RecordedEpisode]:
     """The recordings that can be used; the others are reported."""
     found, failed = [], 0
     for path in paths:
@@ -100,7 +100,7 @@ def _choose(paths: Sequence[Path], successes: bool, say: Reporter) -> list[Recor
     return found
 
 
-def _with_cameras(recordings: Sequence[Recorded]) -> EmbodimentSpec:
+def _with_cameras(recordings: Sequence[RecordedEpisode]) -> EmbodimentSpec:
     """The robot of all recordings, with the cameras that all of them have images of."""
     spec = check_same_embodiment(recordings)
     kept = tuple(c for c in spec.cameras if all(c.name in r.images for r in recordings))
@@ -126,7 +126,11 @@ def _checked_rate(fps: float | None, spec: EmbodimentSpec) -> float:
 
 
 def _write(
-    writer: LeRobotWriter, cameras: Sequence[str], recorded: Recorded, fps: float, say: Reporter
+    writer: LeRobotWriter,
+    cameras: Sequence[str],
+    recorded: RecordedEpisode,
+    fps: float,
+    say: Reporter,
 ) -> int:
     """Add one episode; how many rows it has."""
     times = row_times(recorded, fps)
@@ -145,7 +149,7 @@ def _write(
 
 
 def _newest_images(
-    recorded: Recorded, cameras: Sequence[str], times: Array, fps: float, say: Reporter
+    recorded: RecordedEpisode, cameras: Sequence[str], times: Array, fps: float, say: Reporter
 ) -> dict[str, npt.NDArray[np.intp]]:
     """Camera -> which of its images is the newest at each of ``times``; warns of sparse ones."""
     found = {}

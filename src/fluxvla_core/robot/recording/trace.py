@@ -72,7 +72,7 @@ class Log(Protocol):
         return
 
     def flush(self) -> None:
-        """Give what is there to the system: a process that is killed then loses none of it."""
+        """Flush to the system: a process that is killed then loses none of it."""
 
     def close(self) -> None:
         """Finish the file."""
@@ -104,7 +104,7 @@ def _json(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Recording:
-    """What a complete recording holds beyond events and videos.
+    """The parts of a complete recording besides events and videos.
 
     Args:
         names: ``state`` and ``action`` -> joint names.
@@ -166,7 +166,7 @@ class EpisodeTrace:
     ) -> None:
         self.folder = folder
         self.video_fps = video_fps
-        self.dropped = {"frames": 0, "pictures": 0, "events": 0}
+        self.dropped = {"frames": 0, "images": 0, "events": 0}
         self._recording = recording
         self._source = recording.source if recording is not None else None
         self._cameras = recording.cameras if recording is not None else ()
@@ -201,12 +201,12 @@ class EpisodeTrace:
     def image(self, camera: str, stamp: float, image: Image) -> None:
         """Record a ``(H, W, 3)`` uint8 image that arrived at ``stamp``; once is enough."""
         if self._recording is not None:
-            self._put_image("pictures", (camera, stamp, image))
+            self._put_image("images", (camera, stamp, image))
 
     def depth(self, camera: str, stamp: float, metres: npt.NDArray[np.float32]) -> None:
         """Record an ``(H, W)`` depth image that arrived at ``stamp``; once is enough."""
         if self._recording is not None:
-            self._put_image("pictures", (camera, stamp, metres))
+            self._put_image("images", (camera, stamp, metres))
 
     def close(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Finish every file; ``summary`` and what was dropped become ``episode.json``.
@@ -255,7 +255,7 @@ class EpisodeTrace:
 
     def _finish(self) -> None:
         self._guard(self._poll)
-        self.dropped["pictures"] += sum(poll.missed for poll in self._polls.values())
+        self.dropped["images"] += sum(poll.missed for poll in self._polls.values())
         self._guard(self._log.close)
         for video in self._videos.values():
             self._guard(video.close)

@@ -1,6 +1,6 @@
 """gym-aloha's insertion, ``gym_aloha/AlohaInsertion-v0``: a peg goes into a socket in the air.
 
-The scripted expert rehearses the episode, and its commands are the plan.
+The scripted expert plays the episode in a copy of the simulation first: its commands are the plan.
 Both arms grasp and lift open loop. What they hold has slipped by then, by more than the socket
 leaves room for, so from there on the objects are servoed: each arm corrects its commands by what
 its object's pose lacks, while the two are brought together on one line. That needs the objects'

@@ -27,12 +27,12 @@ from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training import lora
 from fluxvla_core.training.base_runner import BaseTrainRunner
 from fluxvla_core.training.cost import (
-    NOTHING,
+    NO_ACTIVATIONS,
     Footprint,
-    Kept,
+    SavedActivations,
     fake,
+    fake_activations,
     footprint,
-    kept_by_fake,
     optimizer_bytes,
 )
 from fluxvla_core.training.input_sizes import (
@@ -55,7 +55,7 @@ PROCESSES = (1, 2, 4, 8)
 
 
 @dataclass
-class Rehearsal:
+class DryRun:
     """Results of a dry run.
 
     Args:
@@ -91,43 +91,43 @@ class Rehearsal:
     unfit: bool = False
 
 
-def rehearse(context: RunContext, processes: Sequence[int] = PROCESSES) -> Rehearsal:
+def dry_run(context: RunContext, processes: Sequence[int] = PROCESSES) -> DryRun:
     """Build the training of ``context.section`` as far as possible.
 
     Args:
         context: with the config's tree.
         processes: for which numbers of them to count the memory.
     """
-    rehearsal = Rehearsal()
-    notes = rehearsal.notes
-    rehearsal.robot = _tried(notes, "the robot is not known", lambda: robot_of(context.config))
+    result = DryRun()
+    notes = result.notes
+    result.robot = _tried(notes, "the robot is not known", lambda: robot_of(context.config))
     runner = _runner(context, notes)
     sizes = _declared(context)
-    rehearsal.action_shape = chunk_of(sizes)
+    result.action_shape = chunk_of(sizes)
     # Before the data only where nothing else says how long a chunk is.
-    model = None if sizes else _model(context, rehearsal, runner)
-    batch = _batch(context, rehearsal, runner)
-    rehearsal.refused = rehearsal.refused or _unfit(context, rehearsal, runner, sizes, batch)
-    if sizes and not rehearsal.unfit:
-        model = _model(context, rehearsal, runner)
-    rehearsal.skeleton, rehearsal.inputs = model, batch
-    _compare(rehearsal)
-    if rehearsal.refused is not None:
+    model = None if sizes else _model(context, result, runner)
+    batch = _batch(context, result, runner)
+    result.refused = result.refused or _unfit(context, result, runner, sizes, batch)
+    if sizes and not result.unfit:
+        model = _model(context, result, runner)
+    result.skeleton, result.inputs = model, batch
+    _compare(result)
+    if result.refused is not None:
         batch = None
     elif model is not None and batch is not None:
         try:
-            if rehearsal.data is not None and rehearsal.data.dataset is not None:
-                check_observations(observations_of(model), rehearsal.data.dataset, context)
+            if result.data is not None and result.data.dataset is not None:
+                check_observations(observations_of(model), result.data.dataset, context)
             ForwardArguments(model, context.where(f"{context.section}.collator"))(batch)
         except ConfigError as error:
-            rehearsal.refused, batch = error, None
+            result.refused, batch = error, None
     if model is None or runner is None or not processes:
-        return rehearsal
-    if not rehearsal.trained:
-        rehearsal.notes.append("the model has no trainable parameter: all of its parts are frozen")
-        return rehearsal
-    _count(rehearsal, model, runner, batch, processes)
-    return rehearsal
+        return result
+    if not result.trained:
+        result.notes.append("the model has no trainable parameter: all of its parts are frozen")
+        return result
+    _count(result, model, runner, batch, processes)
+    return result
 
 
 def _declared(context: RunContext) -> Mapping[str, Declared]:
@@ -140,7 +140,7 @@ def _declared(context: RunContext) -> Mapping[str, Declared]:
 
 def _unfit(
     context: RunContext,
-    found: Rehearsal,
+    found: DryRun,
     runner: BaseTrainRunner | None,
     sizes: Mapping[str, Declared],
     batch: Mapping[str, Any] | None,
@@ -162,9 +162,7 @@ def _unfit(
     return refusal(wrong, context) if wrong else None
 
 
-def _model(
-    context: RunContext, found: Rehearsal, runner: BaseTrainRunner | None
-) -> nn.Module | None:
+def _model(context: RunContext, found: DryRun, runner: BaseTrainRunner | None) -> nn.Module | None:
     """The model on the meta device, with its adapters; what is known of it goes into ``found``."""
     notes = found.notes
     what = "the model cannot be built on the meta device"
@@ -211,13 +209,15 @@ def memory_of(
         Exception: what a model raises that decides by the values of its inputs.
     """
     options = runner.options
-    by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], Kept] = {}
+    by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], SavedActivations] = {}
     footprints = {}
     for count in processes:
         layout = runner.memory_layout(model, count, device_type)
         lowered = tuple(layout.gathered_as.items())
         if lowered not in by_dtypes:
-            by_dtypes[lowered] = NOTHING if batch is None else kept_of(model, layout, runner, batch)
+            by_dtypes[lowered] = (
+                NO_ACTIVATIONS if batch is None else activations_of(model, layout, runner, batch)
+            )
         footprints[count] = footprint(
             layout,
             by_dtypes[lowered],
@@ -228,14 +228,16 @@ def memory_of(
     return footprints
 
 
-def kept_of(model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]) -> Kept:
-    """What a batch leaves for the backward pass; arguments as of :func:`memory_of`."""
+def activations_of(
+    model: nn.Module, layout: Layout, runner: Strategy, batch: Mapping[str, Any]
+) -> SavedActivations:
+    """Memory that a batch's forward pass saves for the backward pass; see :func:`memory_of`."""
     arguments = ForwardArguments(model)(batch)
-    return kept_by_fake(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
+    return fake_activations(fake(model, layout.gathered_as), arguments, runner.compute_dtype)
 
 
 def _count(
-    found: Rehearsal,
+    found: DryRun,
     model: nn.Module,
     runner: Strategy,
     batch: Mapping[str, Any] | None,
@@ -295,26 +297,26 @@ def _runner(context: RunContext, notes: list[str]) -> BaseTrainRunner | None:
 
 
 def _batch(
-    context: RunContext, rehearsal: Rehearsal, runner: BaseTrainRunner | None
+    context: RunContext, result: DryRun, runner: BaseTrainRunner | None
 ) -> Mapping[str, Any] | None:
     try:
         table = context.config["train_dataloader"]["dataset"]
-        widths = _widths(context.config.get("model", {}), rehearsal.action_shape)
-        rehearsal.data = example(table, context, rehearsal.robot, widths)
-        rehearsal.notes += rehearsal.data.assumed
+        widths = _widths(context.config.get("model", {}), result.action_shape)
+        result.data = example(table, context, result.robot, widths)
+        result.notes += result.data.assumed
         if runner is None:
             return None
         size = runner.loader_options.per_device_batch_size
-        batch: Mapping[str, Any] = runner.collator([rehearsal.data.sample] * size)
+        batch: Mapping[str, Any] = runner.collator([result.data.sample] * size)
     except Refused as refused:
         error = refused.error
         error.where = error.where or context.where("train_dataloader.dataset")
-        rehearsal.refused = error
+        result.refused = error
         return None
     except Exception as error:  # noqa: BLE001 - datasets and transforms of others
-        rehearsal.notes.append(f"the batch is not known: {_one_line(error)}")
+        result.notes.append(f"the batch is not known: {_one_line(error)}")
         return None
-    rehearsal.batch = {
+    result.batch = {
         key: (tuple(value.shape), str(value.dtype).removeprefix("torch."))
         for key, value in batch.items()
         if isinstance(value, Tensor)
@@ -339,25 +341,25 @@ def _named(table: Any, key: str) -> int | None:
     return next((value for value in inner if value is not None), None)
 
 
-def _compare(rehearsal: Rehearsal) -> None:
+def _compare(result: DryRun) -> None:
     """Note where data, model and robot do not fit together."""
-    data, robot, chunk = rehearsal.data, rehearsal.robot, rehearsal.action_shape
+    data, robot, chunk = result.data, result.robot, result.action_shape
     if data is not None and data.dataset is not None and robot is not None:
         for what, have, takes in (
             ("states", data.states, robot.state_dim),
             ("actions", data.actions, robot.dim),
         ):
             if have != takes:
-                rehearsal.notes.append(
+                result.notes.append(
                     f"the dataset's {what} have {have} numbers, those of {robot.name} {takes}"
                 )
     if robot is not None and data is not None:
         missing = sorted(set(data.cameras) - {camera.name for camera in robot.cameras})
         if missing:
-            rehearsal.notes.append(f"{robot.name} has no camera {', '.join(missing)}")
-    actions = rehearsal.batch.get("actions")
+            result.notes.append(f"{robot.name} has no camera {', '.join(missing)}")
+    actions = result.batch.get("actions")
     if chunk is not None and actions is not None and actions[0][1:] != tuple(chunk):
-        rehearsal.notes.append(
+        result.notes.append(
             f"the batch's actions are {actions[0][1:]} a sample, the model's chunks {tuple(chunk)}"
         )
 

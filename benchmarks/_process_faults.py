@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import os
 import pty
+import re
 import select
 import signal
 import struct
@@ -336,9 +337,12 @@ def cyclone_images(running: Program) -> bool:
         return time.monotonic() - float(note.read_text()) > 2 * FROZEN_S
 
     running.wait_for(lambda: silent() or time.monotonic() > until, "freezing", END_S)
-    frozen = running.process.poll() is None and silent()
     running.process.kill()
-    return frozen
+    # It may have been kept waiting by the others, and was not frozen.
+    until = time.monotonic() + END_S
+    while MAIN_KILLED not in running.said and time.monotonic() < until:
+        time.sleep(0.01)
+    return re.search(FROZEN, running.said) is not None
 
 
 def kill_both(running: Program) -> None:
@@ -361,7 +365,9 @@ def _environment(pid: int) -> bytes:
 
 MAIN = "main process"
 LOCKED = r"the main process did not run for 0\.\d+ s"
-KILLED = "fluxvla: the main process was killed; the robot was stopped"
+MAIN_KILLED = "fluxvla: the main process was killed"
+FROZEN = rf"{MAIN_KILLED} \(before that: the main process did not run for 2\.\d+ s.*"
+KILLED = f"{MAIN_KILLED}; the robot was stopped"
 CONTROL = "control process"
 # ``halts``: what is received ends in the middle of a motion, at the last command.
 _FAULTS = [
@@ -427,7 +433,7 @@ PROCESS_FAULTS = tuple(replace(fault, name=PREFIX + fault.name) for fault in _FA
 CYCLONE_FAULT = Fault(
     f"{PREFIX}image reception frozen (reliable images from Cyclone DDS)",
     cyclone_images,
-    r"the main process did not run for 2\.\d+ s",
+    FROZEN,
     around=cyclone_driver,
     environment=FAST_DDS,
     attempts=20,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -91,6 +93,31 @@ def test_catching_up_in_between_begins_the_time_anew():
         watch.check(state, now)
     watch.reset()
     watch.check(behind, 0.7)
+
+
+def test_commands_are_sent_by_another_thread_meanwhile():
+    watch = TrackingWatch(ARM, SETTINGS)
+    command = np.array([1.0, 0.5, 0.0])
+    ended = threading.Event()
+
+    def send():
+        at = 0.0
+        while not ended.is_set():
+            at += 1.0
+            watch.sent(command, at)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        for _ in range(2000):
+            # All that are remembered are looked at: none is this old.
+            watch.check(command, -1.0)
+    finally:
+        ended.set()
+        sender.join()
+        sys.setswitchinterval(interval)
 
 
 def test_prismatic_joints_are_measured_in_metres_and_grippers_not_at_all():

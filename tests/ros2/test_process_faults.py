@@ -10,6 +10,7 @@ import json
 import os
 import re
 import signal
+import time
 from importlib.util import find_spec
 
 import numpy as np
@@ -26,6 +27,7 @@ from benchmarks._process_faults import (
 )
 from benchmarks._process_program import PROVOKED, SENT
 from benchmarks._robot_faults import GOES_ON, MOVING, NAMES, STOP, stage_crew
+from fluxvla_core.robot.recording.recorded import open_recording
 
 pytestmark = pytest.mark.realtime
 OWN_ARM = """
@@ -150,6 +152,32 @@ def test_the_record_of_a_paused_main_process_has_every_command(stage, tmp_path):
     assert len(recorded) >= result.record["steps"]
     np.testing.assert_allclose(recorded, sent[: len(recorded)])
     assert (sent[len(recorded) :] == recorded[-1]).all()
+
+
+def test_a_main_process_that_is_killed_after_it_was_frozen(stage, tmp_path):
+    """Nobody else can say then why the arm stopped, nor complete the record."""
+    made = stage(tmp_path)
+    with program(made) as running:
+        running.wait_for(lambda: len(made.commands()) >= MOVING, "the first command", START_S)
+        running.process.send_signal(signal.SIGSTOP)
+        running.wait_for(running.at_rest, "coming to rest", END_S)
+        running.process.kill()
+        running.process.wait()
+        until = time.monotonic() + END_S
+        while running.processes():
+            assert time.monotonic() < until, running.said
+            time.sleep(0.01)
+        said = running.said
+    silent = r"\(before that: the main process did not run for 0\.\d+ s, safety.silence_s is 0\.2\)"
+    assert re.search(rf"was killed {silent}; the robot was stopped", said), said
+    (folder,) = (tmp_path / "inference").glob("*")
+    recorded = open_recording(folder)
+    assert recorded.whole
+    assert recorded.summary()["trips"][0]["rule"] == "main process"
+    sent = np.fromfile(tmp_path / SENT).reshape(-1, len(NAMES))
+    _, found = recorded.commands()
+    np.testing.assert_allclose(found, sent[: len(found)])
+    assert (sent[len(found) :] == found[-1]).all()
 
 
 def test_an_arm_of_a_plugin_file(stage, tmp_path):

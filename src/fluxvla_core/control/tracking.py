@@ -80,7 +80,9 @@ class TrackingWatch:
             NotFollowing: a joint has been too far behind for too long.
         """
         self.seen = np.asarray(state, dtype=np.float64)
-        command = next((c for at, c in reversed(self._sent) if at <= measured), None)
+        # A copy, in one step: another thread stores commands meanwhile.
+        sent = tuple(self._sent)
+        command = next((c for at, c in reversed(sent) if at <= measured), None)
         if command is None:
             return
         error = self._error(command, state)

@@ -106,6 +106,25 @@ class LinkObserver(EpisodeObserver):
         self._newest: deque[CommandSent | FilterSkipped | Stopped | EpisodeEnded] = deque(
             maxlen=_EVENTS_KEPT
         )
+        self._folder: Path | None = None
+        self._in_episode = False
+
+    def begin(self, folder: Path) -> None:
+        """An episode begins; ``folder`` has its record."""
+        self._newest.clear()
+        self._folder, self._in_episode = folder, True
+
+    def end(self) -> None:
+        """The episode is over; whatever was sent of it may not have been read yet."""
+        self._in_episode = self._inbox.orphaned
+
+    def unread(self) -> tuple[bool, str | None]:
+        """Whether the main process has not taken all that it was sent of the last episode, and what
+        ended that early; None of an episode that only its death ended."""
+        if self._in_episode:
+            return True, None
+        ended = (e.problem for e in reversed(self._newest) if isinstance(e, EpisodeEnded))
+        return (False, None) if self._link.read_by_other else (True, next(ended, None))
 
     def on_event(self, event: Event) -> None:
         if isinstance(event, CommandSent):
@@ -121,7 +140,7 @@ class LinkObserver(EpisodeObserver):
             send = self._link.try_send if isinstance(event, CommandSent) else self._link.send
             send(message.kind, message.arrays, **message.fields)
 
-    def write_rest(self, folder: Path) -> None:
+    def write_rest(self) -> None:
         """Write what the main process, which is dead, did not; the robot was stopped.
 
         Raises:
@@ -129,7 +148,9 @@ class LinkObserver(EpisodeObserver):
         """
         from fluxvla_core.robot.recording.trace import REST_FILE, JsonLines  # rarely needed
 
-        file = JsonLines(folder, REST_FILE)
+        if self._folder is None:
+            return
+        file = JsonLines(self._folder, REST_FILE)
         for event in self._newest:
             file.add(logged(event))
         file.close()
@@ -178,10 +199,12 @@ def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = 
                 else:
                     _carry_out(link, inbox, engine, observer, order)
     finally:
+        unread, problem = observer.unread()
         failures = [engine.stop(), engine.close()]
         link.send(Kind.CLOSED, failures=failures)
         if inbox.orphaned:
-            _report_orphaned(engine, failures)
+            lost = _complete_record(observer) if unread else None
+            _report_orphaned(engine, failures, problem, lost)
 
 
 def _outlive_main(inbox: Inbox) -> None:
@@ -192,15 +215,36 @@ def _outlive_main(inbox: Inbox) -> None:
     os._exit(EXIT_FAILED)
 
 
-def _report_orphaned(engine: Engine, failures: Sequence[str | None]) -> None:
-    """Print what became of the robot: there is no other process that could."""
+def _complete_record(observer: LinkObserver) -> OSError | None:
+    try:
+        observer.write_rest()
+    except OSError as error:
+        return error
+    return None
+
+
+def _report_orphaned(
+    engine: Engine,
+    failures: Sequence[str | None],
+    problem: str | None = None,
+    lost: OSError | None = None,
+) -> None:
+    """Print what became of the robot: there is no other process that could.
+
+    Args:
+        problem: what had stopped the arm, if the main process was frozen by then.
+        lost: why the episode's record is not complete.
+    """
+    before = f" (before that: {problem})" if problem else ""
     # A stop that failed at the episode's end fails again.
     trouble = "; ".join(dict.fromkeys(text for text in (engine.stop_failure, *failures) if text))
     with suppress(OSError):  # The terminal may be gone, too.
         print(
-            f"fluxvla: the main process was killed; {stop_outcome(trouble or None)}",
+            f"fluxvla: the main process was killed{before}; {stop_outcome(trouble or None)}",
             file=sys.stderr,
         )
+        if lost is not None:
+            print(f"fluxvla: the record is not complete: {lost}", file=sys.stderr)
 
 
 def _wait(link: Link, inbox: Inbox, engine: Engine) -> None:
@@ -249,14 +293,14 @@ def _connect(engine: Engine) -> None:
 
 def _run_episode(inbox: Inbox, engine: Engine, observer: LinkObserver, order: Message) -> None:
     inbox.phase = Phase.START
+    observer.begin(Path(order["folder"]))
     try:
         task = Task(order["task"], order["instruction"], order["free"])
         engine.run_episode(task, order["number"], order["seed"], (observer,), Path(order["folder"]))
     finally:
         inbox.phase = Phase.OVER
         gc.collect()
-        if inbox.orphaned:
-            observer.write_rest(Path(order["folder"]))
+        observer.end()
 
 
 def _parts(

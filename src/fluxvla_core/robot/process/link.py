@@ -96,6 +96,11 @@ class Link:
         """How many messages of the other end's ``try_send`` were dropped."""
         return self._in.dropped
 
+    @property
+    def read_by_other(self) -> bool:
+        """Whether the other end took all that was sent to it."""
+        return self._out.empty and not self._waiting
+
     def mark_alive(self) -> None:
         """Store the time: this process runs."""
         self._times[self._own] = time.monotonic_ns()

@@ -41,6 +41,11 @@ class Ring:
         """Bytes of the largest message that an empty ring has room for."""
         return self._size - _RECORD.size
 
+    @property
+    def empty(self) -> bool:
+        """Whether everything that was written was read."""
+        return self._positions[_HEAD] == self._positions[_TAIL]
+
     def fits(self, message: bytes) -> bool:
         """Whether there is room for a message now."""
         positions = self._positions

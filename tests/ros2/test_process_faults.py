@@ -172,7 +172,7 @@ def test_a_main_process_that_is_killed_after_it_was_frozen(stage, tmp_path):
     assert re.search(rf"was killed {silent}; the robot was stopped", said), said
     (folder,) = (tmp_path / "inference").glob("*")
     recorded = open_recording(folder)
-    assert recorded.whole
+    assert recorded.finished
     assert recorded.summary()["trips"][0]["rule"] == "main process"
     sent = np.fromfile(tmp_path / SENT).reshape(-1, len(NAMES))
     _, found = recorded.commands()

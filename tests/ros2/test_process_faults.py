@@ -180,6 +180,27 @@ def test_a_main_process_that_is_killed_after_it_was_frozen(stage, tmp_path):
     assert (sent[len(found) :] == found[-1]).all()
 
 
+def test_a_machine_that_stands_still_is_no_hung_control_process(stage, tmp_path):
+    """The main process may go on first: what it killed then could have held the arm."""
+    made = stage(tmp_path)
+    with program(made) as running:
+        running.wait_for(lambda: len(made.commands()) >= MOVING, "the first command", START_S)
+        control = running.control
+        os.kill(control, signal.SIGSTOP)
+        running.process.send_signal(signal.SIGSTOP)
+        time.sleep(2.0)
+        running.process.send_signal(signal.SIGCONT)
+        time.sleep(0.3)
+        os.kill(control, signal.SIGCONT)
+        time.sleep(1.0)
+        running.type("\x03")
+        running.wait_for(lambda: False, "the end", END_S)
+        said = running.said
+    assert "nothing commands the robot any more" not in said
+    # The state was too old for a moment, or nothing was wrong until Ctrl-C.
+    assert running.process.returncode in (1, 130), said
+
+
 def test_an_arm_of_a_plugin_file(stage, tmp_path):
     """What another process imports is the file itself."""
     made = stage(tmp_path)

@@ -10,6 +10,7 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 
 from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.interrupt import Interrupts
@@ -25,11 +26,14 @@ from fluxvla_core.robot.process.setup import ControlSetup
 from fluxvla_core.robot.robot import STOP_S, Robot
 from fluxvla_core.signals import signal_name
 
+_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Without the folder that it is started in: modules are found where this process finds them.
 _COMMAND = (sys.executable, *(("-P",) if sys.version_info >= (3, 11) else ()), "-m", __package__)
 
 HUNG_S = 1.0
 """For how long the control process may not run before it is given up."""
+# Two looks this far apart: this process did not run either.
+_PAUSED_S = 0.25
 END_S = 2 * STOP_S + 1.0
 """For how long a connection that is only made to stop the robot, or an orderly end, may take."""
 
@@ -80,6 +84,8 @@ class ControlProcess:
         self.server = LinkServer(self.link, robot, interrupts)
         self.holding = self.ended = False
         self._lost = 0
+        # When it was looked at last, and since when it was without a pause.
+        self._looked = self._looking_since = time.monotonic()
 
     @property
     def pid(self) -> int:
@@ -131,10 +137,19 @@ class ControlProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
             raise self._gone("stopped responding to this process and was ended")
-        patience_s, silent_s = self._patience_s(), self.link.silent_s()
+        patience_s, silent_s = self._patience_s(), self._silent_s()
         if code is None and patience_s is not None and silent_s > patience_s:
             self._process.kill()
             raise self._gone(f"did not run for {silent_s:.1f} s and was killed")
+
+    def _silent_s(self) -> float:
+        """How long it has not run while this process did: both stand still where the machine does,
+        and this one may be the first to go on."""
+        now = time.monotonic()
+        if now - self._looked > _PAUSED_S:
+            self._looking_since = now
+        self._looked = now
+        return min(self.link.silent_s(), now - self._looking_since)
 
     def _patience_s(self) -> float | None:
         """How long it may not run; None while it waits for the operator."""
@@ -185,6 +200,8 @@ def launch(
         process = subprocess.Popen(
             [*_COMMAND, *map(str, (memory, reads, *(frame_memory or ())))],
             pass_fds=(memory, reads, *(frame_memory or ())),
+            # A thread with a real-time priority must not wait for others of a pool.
+            env={**dict.fromkeys(_POOLS, "1"), **os.environ},
             stdin=subprocess.DEVNULL,
             # Ctrl-C, and a terminal that closes, are for this process alone.
             start_new_session=True,

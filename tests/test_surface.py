@@ -110,6 +110,18 @@ def test_a_deprecated_name_works_and_names_the_new_one():
     assert "share_buffers" not in training.__all__
     with pytest.warns(DeprecationWarning, match=r"share_buffers is deprecated, use .*\.broadcast_"):
         assert training.share_buffers is training.broadcast_buffers
+    with pytest.warns(DeprecationWarning, match=r"left_out is deprecated, use .*external_weights"):
+        assert training.left_out is training.external_weights
+
+
+def test_a_train_runner_s_deprecated_attribute_is_the_new_one():
+    from fluxvla_core.testing.training import OneProcessRunner
+
+    runner = object.__new__(OneProcessRunner)
+    with pytest.warns(DeprecationWarning, match="left_out is deprecated, use external_weights"):
+        runner.left_out = "found"
+    with pytest.warns(DeprecationWarning, match="left_out is deprecated"):
+        assert runner.left_out == runner.external_weights == "found"
 
 
 def python_of(path: Path) -> list[str]:

@@ -227,6 +227,17 @@ def test_the_second_comes_right_behind_the_first():
 
 @on_linux
 @as_root
+def test_the_control_process_s_threads_come_before_those_of_the_main_process():
+    printed = inside(
+        "def show(): print(os.sched_getparam(0).sched_priority)\n"
+        "realtime.yield_to_control_process(); realtime.raise_priority(); show()"
+    )
+
+    assert printed == ["48"]
+
+
+@on_linux
+@as_root
 def test_the_second_is_an_ordinary_one_while_it_computes_for_long():
     printed = inside(
         "def show(): print(os.sched_getparam(0).sched_priority)\n"

@@ -11,7 +11,7 @@ from fluxvla_models.act import ACT
 from fluxvla_models.diffusion_policy import DiffusionPolicy
 
 from fluxvla_core.errors import CheckpointError, ConfigError
-from fluxvla_core.training.weights import load_part_weights
+from fluxvla_core.training.part_weights import load_part_weights
 from tests.oracles import fill
 
 KEYS = json.loads((Path(__file__).parent / "keys" / "lerobot_act.json").read_text())

@@ -34,6 +34,7 @@ PRIORITY = 50
 _TIMER_ABSTIME = 1  # of <time.h>
 _LOCK_ALL_IN_USE = 1 | 2 | 4  # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT of <sys/mman.h>
 _entered = 0  # blocks of ``real_time`` that are open
+_next = PRIORITY - 1  # what ``raise_priority`` gives
 
 
 class _Timespec(ctypes.Structure):
@@ -158,7 +159,17 @@ def raise_priority() -> bool:
 
     For a thread that never computes for long, such as one that only stores what arrives.
     """
-    return _raise(PRIORITY - 1) is not None
+    return _raise(_next) is not None
+
+
+def yield_to_control_process() -> None:
+    """Let ``raise_priority`` give less from now on: another process commands the robot.
+
+    Threads of the same real-time priority do not take turns: one of this process that has much to
+    do, such as with images, would keep out a thread of the control process that holds its GIL.
+    """
+    global _next
+    _next = PRIORITY - 2
 
 
 @contextmanager

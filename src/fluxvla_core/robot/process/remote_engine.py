@@ -83,6 +83,7 @@ class RemoteEngine(Engine):
         self._facts: Mapping[str, Any] = {}
 
     def connect(self) -> None:
+        realtime.yield_to_control_process()
         self._start()
         self._robot.connect()
 

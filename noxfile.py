@@ -131,8 +131,9 @@ def environments(session: nox.Session) -> None:
 
 @nox.session
 def oracles(session: nox.Session) -> None:
-    """Compute the golden files again with the reference implementations, and compare.
+    """Compute the golden files again with LeRobot, and compare.
 
+    Programs for other references are run by hand (CONTRIBUTING.md, "Golden files"), and are listed.
     Also runs the tests of fluxvla-lerobot that need LeRobot.
     """
     with Steps(session) as step:

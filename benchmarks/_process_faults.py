@@ -429,7 +429,7 @@ _FAULTS = [
     Fault("hook blocks for 5 s", order("hook blocks"), outcome=GOES_ON, exit_code=0),
 ]
 PROCESS_FAULTS = tuple(replace(fault, name=PREFIX + fault.name) for fault in _FAULTS)
-# Not in the table of docs/safety.md: it comes about by chance, and only on a busy machine.
+# Provoked every night: it takes ten busy processes, and comes about by chance.
 CYCLONE_FAULT = Fault(
     f"{PREFIX}image reception frozen (reliable images from Cyclone DDS)",
     cyclone_images,

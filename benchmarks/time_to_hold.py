@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import _process_faults, _results, _robot_faults, _whole_faults
-from benchmarks._process_faults import PROCESS_FAULTS
+from benchmarks._process_faults import CYCLONE_FAULT, PROCESS_FAULTS
 from benchmarks._robot_fault_list import FAULTS
 from benchmarks._robot_faults import Fault, Result, Stage, stage_crew
 from benchmarks._whole_faults import WHOLE_FAULTS
 
 NO_HOLD = "no hold: the last command stays"
-ALL = (*FAULTS, *PROCESS_FAULTS, *WHOLE_FAULTS)
+ALL = (*FAULTS, *PROCESS_FAULTS, CYCLONE_FAULT, *WHOLE_FAULTS)
 
 
 def played(stage: Callable[[Path], Stage], folder: Path, fault: Fault) -> Result:
@@ -40,9 +40,9 @@ def played(stage: Callable[[Path], Stage], folder: Path, fault: Fault) -> Result
     for attempt in range(fault.attempts):
         if fault in WHOLE_FAULTS:
             result = _whole_faults.play(folder / str(attempt), fault)
-        elif fault in PROCESS_FAULTS:
+        elif fault in (*PROCESS_FAULTS, CYCLONE_FAULT):
             # Drivers that still know a killed process may keep their images from the next one.
-            with stage_crew() as fresh:
+            with stage_crew(fault.environment) as fresh:
                 result = _process_faults.play(fresh(folder / str(attempt)), fault)
         else:
             result = _robot_faults.play(stage(folder / str(attempt)), fault)
@@ -69,7 +69,7 @@ def shown(found: dict[str, Any]) -> str:
     Without a command after the fault the time is 0: nothing holds the arm.
     """
     without = {"refused": "nothing moves", "goes on": "goes on"}.get(found["outcome"])
-    return without or _time(found["median_s"])
+    return without or _time(found["max_s"])
 
 
 def _time(seconds: float) -> str:

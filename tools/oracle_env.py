@@ -8,10 +8,6 @@ anywhere. ``nox -s oracles`` makes the environments, runs all these programs aga
 
     python -m tools.oracle_env [NAME]     prints the Python of an environment (lerobot061)
 
-openpi and OpenVLA are on no index: their environments import from a checkout of the commit that is
-compared with, in ``.nox/oracles/sources``. Where git cannot reach a repository, ``git config
---global url.PLACE.insteadOf URL`` names a copy.
-
 LeRobot 0.6.1 is written for Python 3.12: with 3.11, the few lines of its installed copy whose
 syntax is new are rewritten. What they say stays the same.
 """
@@ -19,10 +15,8 @@ syntax is new are rewritten. What they say stays the same.
 from __future__ import annotations
 
 import re
-import shutil
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 from tools import lerobot_env, project, shell, torch_build
@@ -166,166 +160,10 @@ def without_type_parameters(text: str) -> str:
     return text[: first.start()] + head + text[first.start() :]
 
 
-# -- code that no index has ------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Source:
-    """A commit of a public repository, and the folder of it that is imported from."""
-
-    url: str
-    commit: str
-    inside: str = ""
-
-    def folder(self) -> Path:
-        """What is imported from; the repository is cloned if it is not there yet.
-
-        Raises:
-            StepFailed: it cannot be cloned, or has no such commit.
-        """
-        name = f"{self.url.rpartition('/')[2]}-{self.commit[:7]}"
-        whole = ORACLES / "sources" / name
-        if not whole.is_dir():
-            partial = whole.with_suffix(".partial")
-            shutil.rmtree(partial, ignore_errors=True)
-            shell.run(["git", "clone", "-q", "--no-checkout", self.url, partial], quiet=True)
-            shell.run(["git", "-C", partial, "checkout", "-q", self.commit], quiet=True)
-            partial.rename(whole)
-        return whole / self.inside
-
-
-OPENPI = Source(
-    "https://github.com/Physical-Intelligence/openpi",
-    "15a9616a00943ada6c20a0f158e3adb39df2ccac",
-    "src",
-)
-OPENVLA = Source("https://github.com/openvla/openvla", "c8f03f48af692657d3060c19588038c7220e9af9")
-OPENVLA_OFT = Source(
-    "https://github.com/moojink/openvla-oft", "213c5ff8d6e9673885d7e4dd6f2ce73b5d8a45db"
-)
-OFT_TRANSFORMERS = Source(
-    "https://github.com/moojink/transformers-openvla-oft",
-    "bc339d9ad707454c0c115970db43c260067c61ab",
-    "src",
-)
-PRISMATIC = (
-    "diffusers<0.36",
-    "huggingface-hub<1",
-    "pillow",
-    "pyyaml",
-    "regex",
-    "requests",
-    "safetensors",
-    "tokenizers==0.19.1",
-)
-JAX = (
-    "augmax",
-    "beartype==0.19.0",
-    "einops",
-    "flax==0.10.2",
-    "jax==0.5.3",
-    "jaxtyping==0.2.36",
-    "ml_collections==1.0.0",
-    "numpy<2",
-    "orbax-checkpoint==0.11.13",
-    "safetensors",
-    "transformers==4.53.2",
-)
-
-
-def prepare_sources(
-    log: Callable[[str], None],
-    name: str,
-    needs: Sequence[str],
-    sources: Sequence[Source] = (),
-    torch: bool = True,
-    finish: Callable[[Env], None] | None = None,
-) -> Env:
-    """An environment with packages of an index, and ``sources`` to import from.
-
-    Args:
-        name: of its folder.
-        needs: requirements; torch is that of ``constraints.txt``.
-        finish: called when all is installed.
-
-    Raises:
-        StepFailed: something cannot be installed or cloned.
-    """
-    env = OracleEnv(ORACLES / name)
-    version = project.constrained_version("torch") if torch else ""
-    base = {"python": sys.version, "torch": version, "needs": " ".join(needs)}
-
-    def install_base() -> None:
-        if torch:
-            torch_build.install(env, version, None, log)
-        env.pip_install(*needs, quiet=True)
-
-    def install_parts(changed: list[str], fresh: bool) -> None:
-        (packages,) = env.root.glob("lib/python*/site-packages")
-        places = "".join(f"{source.folder()}\n" for source in sources)
-        (packages / "sources.pth").write_text(places, encoding="utf-8")
-        if finish is not None:
-            finish(env)
-
-    parts = {"sources": " ".join(source.commit for source in sources) or "none"}
-    env.filled(base, parts, install_base, install_parts)
-    return env
-
-
-def prepare_openpi(log: Callable[[str], None]) -> Env:
-    """openpi's PyTorch models, with the files that it replaces in transformers (its README)."""
-
-    def replace(env: Env) -> None:
-        (package,) = env.root.glob("lib/python*/site-packages/transformers")
-        theirs = OPENPI.folder() / "openpi" / "models_pytorch" / "transformers_replace"
-        shutil.copytree(theirs, package, dirs_exist_ok=True)
-
-    needs = ("transformers==4.53.2", "safetensors")
-    return prepare_sources(log, "openpi", needs, [OPENPI], finish=replace)
-
-
-def prepare_openpi_jax(log: Callable[[str], None]) -> Env:
-    """openpi's models in JAX."""
-    return prepare_sources(log, "openpi_jax", JAX, [OPENPI])
-
-
-def prepare_openvla(log: Callable[[str], None]) -> Env:
-    """The code of OpenVLA, with the transformers that it was made for."""
-    needs = (*PRISMATIC, "transformers==4.40.1")
-    return prepare_sources(log, "openvla", needs, [OPENVLA], finish=_vision)
-
-
-def prepare_openvla_oft(log: Callable[[str], None]) -> Env:
-    """The code of OpenVLA-OFT, with its own transformers."""
-    sources = [OPENVLA_OFT, OFT_TRANSFORMERS]
-    return prepare_sources(log, "openvla_oft", PRISMATIC, sources, finish=_vision)
-
-
-def prepare_tensorflow(log: Callable[[str], None]) -> Env:
-    """TensorFlow."""
-    return prepare_sources(
-        log, "tensorflow", ("tensorflow-cpu==2.21.0", "safetensors"), torch=False
-    )
-
-
-def _vision(env: Env) -> None:
-    """timm, and torchvision without its compiled part, which is for another build of torch.
-
-    With their requirements pip would replace torch by that other build.
-    """
-    env.pip_install("--no-deps", "timm==0.9.16", "torchvision==0.28.0", quiet=True)
-    lerobot_env.declare_operators(env)
-
-
 # What a program's line ``ENVIRONMENT = "NAME"`` may say.
 ENVIRONMENTS: dict[str, Callable[[Callable[[str], None]], Env]] = {
     "lerobot044": prepare_044,
     "lerobot061": prepare,
-    "openpi": prepare_openpi,
-    "openpi_jax": prepare_openpi_jax,
-    "openvla": prepare_openvla,
-    "openvla_oft": prepare_openvla_oft,
-    "tensorflow": prepare_tensorflow,
 }
 
 

@@ -17,6 +17,9 @@ def test_every_golden_file_of_the_repository_has_a_program_with_an_environment()
     assert {p.environment for p in found} <= {*oracle_env.ENVIRONMENTS, None}
     by_hand = [p.path.read_text(encoding="utf-8") for p in found if p.environment is None]
     assert all("environment with" in text.split('"""')[1] for text in by_hand)
+    guide = (project.ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    listed = {p.path.relative_to(project.ROOT).as_posix() for p in found if p.environment is None}
+    assert set(re.findall(r"^\| `(plugins/\S+/make_\w+\.py)` \|", guide, re.MULTILINE)) == listed
     folders = set(project.ROOT.glob("plugins/*/tests/golden"))
     assert folders == {p.golden for p in found}
 

@@ -1,8 +1,10 @@
 """Golden files from the authors' own code of OpenVLA; and its tensors' names.
 
-From the repository's root, in an environment with that code (``tools/oracle_env.py``):
+By hand: a checkout of github.com/openvla/openvla (c8f03f4), and an environment with torch 2.13.0,
+timm 0.9.16 and torchvision 0.28.0 (both without what they depend on), transformers 4.40.1,
+tokenizers 0.19.1, safetensors and pillow. From the repository's root:
 
-    OMP_NUM_THREADS=1 PYTHONPATH=. $(python -m tools.oracle_env openvla) \\
+    OMP_NUM_THREADS=1 PYTHONPATH=.:CHECKOUT ENVIRONMENT/bin/python \\
         plugins/fluxvla-openvla/tests/oracles/make_openvla.py [FOLDER]
 
 The models are tiny, but for the vocabulary, in which the code has fixed numbers. Every tensor is
@@ -26,7 +28,6 @@ from safetensors.numpy import save_file
 
 from tests.oracles import fill
 
-ENVIRONMENT = "openvla"
 HERE = Path(__file__).parent
 DINO = {"embed_dim": 32, "depth": 3, "num_heads": 2, "mlp_ratio": 2.0}
 SIGLIP = {"embed_dim": 48, "depth": 3, "num_heads": 3, "mlp_ratio": 2.0}

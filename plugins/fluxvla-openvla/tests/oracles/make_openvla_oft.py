@@ -1,8 +1,10 @@
 """Golden files from the authors' own code of OpenVLA-OFT; and a file's tensors' names.
 
-From the repository's root, in an environment with that code (``tools/oracle_env.py``):
+By hand: checkouts of github.com/moojink/openvla-oft (213c5ff) and of
+github.com/moojink/transformers-openvla-oft (bc339d9), and an environment with make_openvla.py's
+packages and diffusers, but without transformers. From the repository's root:
 
-    OMP_NUM_THREADS=1 PYTHONPATH=. $(python -m tools.oracle_env openvla_oft) \\
+    OMP_NUM_THREADS=1 PYTHONPATH=.:CHECKOUT:TRANSFORMERS/src ENVIRONMENT/bin/python \\
         plugins/fluxvla-openvla/tests/oracles/make_openvla_oft.py [FOLDER]
 
 Sizes and inputs are those of make_openvla.py. ``--names`` instead of FOLDER writes names and shapes
@@ -30,7 +32,6 @@ from make_openvla import (
 
 from tests.oracles import fill
 
-ENVIRONMENT = "openvla_oft"
 OF_HEAD = ("model.fc1.bias", "model.mlp_resnet_blocks.1.ffn.1.weight")
 OF_STATE = ("fc1.weight",)
 OF_FILM = ("vision_backbone.featurizer.blocks.1.scale.bias",)

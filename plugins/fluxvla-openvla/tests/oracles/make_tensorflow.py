@@ -1,14 +1,12 @@
 """Golden file of the operations on images that OpenVLA's code leaves to TensorFlow.
 
-From the repository's root, in an environment with TensorFlow (``tools/oracle_env.py``):
+In an environment with tensorflow-cpu, safetensors and numpy, from the root of the repository:
 
-    PYTHONPATH=. $(python -m tools.oracle_env tensorflow) \\
-        plugins/fluxvla-openvla/tests/oracles/make_tensorflow.py [FOLDER]
+    PYTHONPATH=. python plugins/fluxvla-openvla/tests/oracles/make_tensorflow.py
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +15,9 @@ from safetensors.numpy import save_file
 
 from tests.oracles import fill
 
-ENVIRONMENT = "tensorflow"
-
 
 def main() -> None:
-    """Write ``tensorflow.safetensors``."""
+    """Write ``golden/tensorflow.safetensors``."""
     picture = fill.integers("picture", (48, 64, 3), 256).astype(np.uint8)
     smooth = tf.image.resize(picture, (40, 40)).numpy().astype(np.uint8)
     small = tf.image.resize(smooth, (28, 28), method="lanczos3", antialias=True)
@@ -38,10 +34,9 @@ def main() -> None:
     changed = tf.clip_by_value(tf.image.adjust_contrast(changed, 1.15), 0, 1)
     changed = tf.clip_by_value(tf.image.adjust_saturation(changed, 0.85), 0, 1)
     arrays["jittered"] = _bytes(tf.clip_by_value(tf.image.adjust_hue(changed, -0.04), 0, 1))
-    default = Path(__file__).parents[1] / "golden"
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else default
+    file = Path(__file__).parents[1] / "golden" / "tensorflow.safetensors"
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    save_file(arrays, folder / "tensorflow.safetensors", {"tensorflow": tf.__version__})
+    save_file(arrays, file, {"tensorflow": tf.__version__})
 
 
 def _bytes(image: tf.Tensor) -> np.ndarray:

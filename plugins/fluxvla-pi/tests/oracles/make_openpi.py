@@ -1,8 +1,11 @@
 """PI0 and PI0.5 of openpi's PyTorch port with tiny weights: losses, gradients, sampled actions.
 
-From the repository's root, in an environment with openpi 15a9616 (``tools/oracle_env.py``):
+By hand: a checkout of github.com/Physical-Intelligence/openpi (15a9616), and an environment with
+torch 2.13.0 and ``transformers==4.53.2``, with the files of the checkout's
+``src/openpi/models_pytorch/transformers_replace`` copied over the latter (openpi's README).
+From the repository's root:
 
-    OMP_NUM_THREADS=1 PYTHONPATH=. $(python -m tools.oracle_env openpi) \\
+    OMP_NUM_THREADS=1 PYTHONPATH=.:CHECKOUT/src ENVIRONMENT/bin/python \\
         plugins/fluxvla-pi/tests/oracles/make_openpi.py [FOLDER]
 
 What is not openpi's here: the sizes of the networks, which its code has written into it; and the
@@ -23,7 +26,6 @@ from safetensors.torch import save_file
 
 from tests.oracles import fill
 
-ENVIRONMENT = "openpi"
 COMMIT = "15a9616a00943ada6c20a0f158e3adb39df2ccac"
 VERSIONS = {
     "openpi": COMMIT,

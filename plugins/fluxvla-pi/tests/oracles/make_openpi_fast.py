@@ -1,8 +1,11 @@
 """PI0-FAST of openpi's own JAX code with tiny weights: losses, gradients, greedy answers.
 
-From the repository's root, in an environment with openpi 15a9616 and JAX (``tools/oracle_env.py``):
+By hand: a checkout of github.com/Physical-Intelligence/openpi (15a9616), and an environment with
+what its modules import, of which these versions matter: ``jax==0.5.3 flax==0.10.2 numpy<2
+ml_collections==1.0.0 orbax-checkpoint==0.11.13 jaxtyping==0.2.36 beartype==0.19.0 augmax einops
+safetensors torch transformers==4.53.2``. From the repository's root:
 
-    OMP_NUM_THREADS=1 PYTHONPATH=. $(python -m tools.oracle_env openpi_jax) \\
+    OMP_NUM_THREADS=1 PYTHONPATH=.:CHECKOUT/src ENVIRONMENT/bin/python \\
         plugins/fluxvla-pi/tests/oracles/make_openpi_fast.py [FOLDER]
 
 What is not openpi's here: the sizes, which its code has written into it. Weights have the names and

@@ -157,7 +157,7 @@ def test_nothing_is_evaluated_after_a_stop_during_the_last_save(
     assert (ended.code, ended.err) == (
         0,
         f"training is complete and saved, but not evaluated: {number.name} came at its end\n"
-        "  next: fluxvla run --config t.py --section eval --work-dir work_dirs/t --log-format text "
-        "--set runner.max_steps=2 --plugin toy.py --plugin tiny.py\n",
+        "  next: fluxvla run --config t.py --section eval --work-dir work_dirs/t "
+        "--set runner.max_steps=2 --plugin toy.py --plugin tiny.py --log-format text\n",
     )
     assert Path("work_dirs/t/checkpoints/step-000000002/manifest.json").exists()

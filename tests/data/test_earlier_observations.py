@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from fluxvla_core.build import RunContext
-from fluxvla_core.contracts.training import VLA
 from fluxvla_core.data.dataset import ParquetDataset
 from fluxvla_core.data.loader import DictCollator, make_loader
 from fluxvla_core.data.mixture import DistributedRepeatingDataset
 from fluxvla_core.data.sampler import StepPlan, StepSampler
 from fluxvla_core.data.transforms.images import normalized
 from fluxvla_core.errors import ConfigError, DataError
-from fluxvla_core.training.model import check_observations
+from fluxvla_core.training.input_sizes import check_observations
 
 STARTS = (0, 7, 19)
 SIZED = {"type": "ResizeImages", "height": 16, "width": 24}
@@ -121,21 +119,14 @@ def test_what_does_not_fit_is_refused(shared):
         load(shared, ())[0]
 
 
-class Two(VLA, nn.Module):
-    n_obs_steps, past_actions = 2, 1
-
-    def forward(self, images):
-        return {"loss": images.mean()}
-
-
 @pytest.mark.parametrize("name", ["n_obs_steps", "past_actions"])
 def test_a_dataset_shows_what_its_model_takes(shared, name):
     settings = {"n_obs_steps": 2, "past_actions": 1}
-    check_observations(Two(), load(shared, **settings), RunContext())
+    check_observations(settings, load(shared, **settings), RunContext())
     wrong = load(shared, **{**settings, name: settings[name] - 1})
     told = rf"{name} of the model is {settings[name]}, that of the dataset {settings[name] - 1}"
     mixture = DistributedRepeatingDataset([wrong])
     for dataset in (wrong, mixture):
         with pytest.raises(ConfigError, match=told) as caught:
-            check_observations(Two(), dataset, RunContext(), "val_dataloader")
+            check_observations(settings, dataset, RunContext(), "val_dataloader")
         assert f"val_dataloader.dataset.{name}={settings[name]}" in str(caught.value.next)

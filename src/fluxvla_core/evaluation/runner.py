@@ -150,8 +150,8 @@ class EvalRunner(Runner):
             self.context.reporter.info(f"evaluating {self._checkpoint['path']}")
         path = None if self._checkpoint is None else self._checkpoint["path"]
         if path is not None:
-            match_checkpoint(path, given.dataset, self._spec)
             self._check_joining(path)
+            match_checkpoint(path, given.dataset, self._spec)
         sources = {POLICY: given.source(policy, path)}
         if given.baseline:
             sources[UNTRAINED] = given.source(UNTRAINED, path)

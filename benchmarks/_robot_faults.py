@@ -261,8 +261,11 @@ def stage_crew(environment: Mapping[str, str] | None = None) -> Iterator[Callabl
                     crew[0] = Driver(STREAMS, SINKS, name="robot")
                 robot, ear = crew
                 robot.tell(reset=True)
+                made = Stage(folder, robot, ear, empty)
+                # What a process that was killed sent last may still arrive.
+                settled(made)
                 ear.heard.clear()
-                return Stage(folder, robot, ear, empty)
+                return made
 
             yield make
         finally:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 pytest.importorskip("mujoco")
 pytest.importorskip("fluxvla_sim")
 
@@ -122,6 +122,8 @@ def test_weights_of_another_family(
     other = tiny("act", tmp_path / "act", data)
     command = ["run", "--section", "runner", "--set", "runner.max_steps=2"]
     assert main([*command, "--config", str(other), "--work-dir", str(tmp_path / "other")]) == 0
+    # The command's own process would end here.
+    torch.distributed.destroy_process_group()
     config = tiny("diffusion", tmp_path / "diffusion", data)
     calls = built(config)
     command = ["run", "--config", str(config), "--section", "runner"]

@@ -116,7 +116,7 @@ def _train(plan: Plan, runner: Any, context: Any) -> tuple[Any, int]:
 
     with located(context.where("train_dataloader.dataset")):
         dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
-    if isinstance(runner, BaseTrainRunner):
+    if isinstance(runner, BaseTrainRunner):  # another's collator may not be an attribute
         check_data(context, dataset, runner.collator)
     try:
         runner.run_setup(n_train_examples=len(dataset))

@@ -216,7 +216,8 @@ def _check_sizes(table: Any, batch: Mapping[str, Any], horizon: int, where: str)
     from fluxvla_core.training.input_sizes import advice, declared_sizes, misfits
 
     sizes = declared_sizes(table)
-    found = [f"model.{one.key}: {one.text}" for one in misfits(table, batch, sizes)]
+    wrong = misfits(table, batch, sizes)
+    found = [f"model.{one.key}: {one.text}" for one in wrong]
     chunk = sizes.get("horizon")
     if chunk is not None and chunk.value != horizon:
         found.append(
@@ -229,7 +230,7 @@ def _check_sizes(table: Any, batch: Mapping[str, Any], horizon: int, where: str)
             where=where,
             cause="its files belong to different trainings, or the section's dataset is not that "
             "of its training",
-            next=advice(misfits(table, batch, sizes)) or None,
+            next=advice(wrong) or None,
         )
 
 

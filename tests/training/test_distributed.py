@@ -171,7 +171,8 @@ def test_what_is_of_this_rank_is_not_blamed_on_another(error):
 
 
 def interfaces(folder, local_size):
-    os.environ.pop("GLOO_SOCKET_IFNAME", None)
+    for kind in ("GLOO", "NCCL"):  # set in the parent by any test that made a process group there
+        os.environ.pop(f"{kind}_SOCKET_IFNAME", None)
     os.environ["LOCAL_WORLD_SIZE"] = local_size
     world = start("cpu")
     names = [os.environ.get(f"{kind}_SOCKET_IFNAME") for kind in ("GLOO", "NCCL")]

@@ -162,7 +162,7 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.contracts.training import VLA
         from fluxvla_core.training import lora
         from fluxvla_core.training.cost import Meter
-        from fluxvla_core.training.input_sizes import check_start
+        from fluxvla_core.training.fit_checks import check_start
         from fluxvla_core.training.model import checkpoint_activations, compile_units
         from fluxvla_core.training.part_weights import load_part_weights
         from fluxvla_core.training.state import seed_all

@@ -10,10 +10,10 @@ from fluxvla_models.conv_encoder import ConvEncoder, SpatialSoftmax
 from fluxvla_models.flow_matching_head import FlowMatchingHead
 from fluxvla_models.sentence_encoder import MINILM, SentenceEncoder
 
+from fluxvla_core import build_vla_from_cfg
 from fluxvla_core.config.load import load_config
 from fluxvla_core.data import resolve_model_path
 from fluxvla_core.errors import ConfigError
-from fluxvla_core.models import build_vla_from_cfg
 
 ROOT = Path(__file__).parents[3]
 SMALL = {

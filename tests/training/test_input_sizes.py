@@ -214,11 +214,12 @@ def test_validation_data_are_compared_too_and_all_that_does_not_fit_is_listed_at
     assert "--set val_dataloader.dataset.n_obs_steps=1" in error.value.next
 
 
-def checkpoint(folder, kind):
+def checkpoint(folder, kind, **parts):
     from fluxvla_core.checkpoints.writer import CheckpointWriter
 
     with CheckpointWriter(folder, 1, 0) as writer:
-        config = {"format": "fluxvla-config-1", "config": {"model": {"type": kind}}, "origins": {}}
+        tree = {"model": {"type": kind, **parts}}
+        config = {"format": "fluxvla-config-1", "config": tree, "origins": {}}
         writer.write_json("config.resolved.json", config)
         return writer.commit()
 
@@ -233,4 +234,23 @@ def test_a_checkpoint_of_another_family(tmp_path):
 @pytest.mark.parametrize("kind", ["Sized", "some-plugin:Sized", "BaseSized", "NotInstalled"])
 def test_a_checkpoint_of_the_same_family_or_of_an_unknown_one(tmp_path, kind):
     checkpoint(tmp_path, kind)
+    check_family(str(tmp_path), TABLE)
+
+
+def test_a_checkpoint_of_the_same_class_with_another_part(tmp_path):
+    path = checkpoint(tmp_path, "Sized", vla_head={"type": "Seeing"})
+    words = "the vla_head of the checkpoint's Sized is Seeing, that of the config's model is Head"
+    HEADS.register_module()(Seeing)
+    try:
+        with pytest.raises(CheckpointError, match=words) as error:
+            check_family(str(tmp_path), TABLE)
+    finally:
+        HEADS.unregister("Seeing")
+    assert error.value.where == str(path)
+    assert "let model.vla_head.type be Seeing" in error.value.next
+
+
+@pytest.mark.parametrize("part", [{"type": "NotInstalled"}, {"type": "some-plugin:Head"}, None])
+def test_a_part_of_the_same_class_or_of_an_unknown_one(tmp_path, part):
+    checkpoint(tmp_path, "Sized", vla_head=part)
     check_family(str(tmp_path), TABLE)

@@ -12,11 +12,12 @@ from typing import Any
 
 from fluxvla_core.build import RunContext, class_of
 from fluxvla_core.checkpoints.checkpoint import Checkpoint
+from fluxvla_core.config.resolve import SLOTS
 from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import VLA, Dataset
 from fluxvla_core.data.sampler import SampleKey
 from fluxvla_core.errors import CheckpointError, ConfigError, PluginError, Problem, located
-from fluxvla_core.plugins.registry import VLAS
+from fluxvla_core.plugins.registry import BY_NAME, VLAS
 from fluxvla_core.training.input_sizes import (
     Declared,
     Misfit,
@@ -27,6 +28,8 @@ from fluxvla_core.training.input_sizes import (
 
 _OBSERVATIONS = {"n_obs_steps": 1, "past_actions": 0}
 """What a model takes that does not say."""
+_PARTS = ("vision_backbone", "projector", "llm_backbone", "vlm_backbone", "vla_head")
+_BY_FILE = "of weights that have the same names all the same, name the file itself"
 _DATA = {"train_dataloader": "the data", "val_dataloader": "the validation data"}
 
 
@@ -191,8 +194,9 @@ def check_start(
 
 
 def check_family(place: str, table: Any) -> None:
-    """Refuse a checkpoint of another class of models than the config's, before either is built.
+    """Refuse a checkpoint of another model than the config's, before either is built.
 
+    Another class, or another class of a part, such as the two backbones of GR00T N1.5 and N1.7.
     A file of weights alone does not say of what it is, and a class may inherit another's weights.
 
     Args:
@@ -207,21 +211,30 @@ def check_family(place: str, table: Any) -> None:
     if place.endswith(".safetensors") or place.startswith(HUB) or not isinstance(table, Mapping):
         return  # what the hub has is fetched by one process, when weights are read
     if is_foreign(place):
-        theirs, where = read_foreign(place).model.get("type"), str(foreign_folder(place))
+        model, where = read_foreign(place).model, str(foreign_folder(place))
     else:
         checkpoint = Checkpoint.open(place)
-        model, where = checkpoint.config().get("model"), str(checkpoint.path)
-        theirs = model.get("type") if isinstance(model, Mapping) else None
-    ours = table.get("type")
-    if not isinstance(theirs, str) or not isinstance(ours, str) or _related(theirs, ours):
+        model, where = checkpoint.config().get("model", {}), str(checkpoint.path)
+    if not isinstance(model, Mapping):
         return
-    there, here = (name.rpartition(":")[2] for name in (theirs, ours))
-    raise CheckpointError(
-        f"the checkpoint is of {there}, the config's model is {here}",
-        where=where,
-        next=f"name a checkpoint of {here}, or let the config's model be {there}; of weights that "
-        "have the same names all the same, name the file itself",
-    )
+    if not _related(model, table, "model"):
+        there, here = _class_name(model), _class_name(table)
+        raise CheckpointError(
+            f"the checkpoint is of {there}, the config's model is {here}",
+            where=where,
+            next=f"name a checkpoint of {here}, or let the config's model be {there}; {_BY_FILE}",
+        )
+    for part in _PARTS:
+        theirs, ours = model.get(part), table.get(part)
+        if not _related(theirs, ours, part):
+            there, here = _class_name(theirs), _class_name(ours)
+            raise CheckpointError(
+                f"the {part} of the checkpoint's {_class_name(model)} is {there}, that of the "
+                f"config's model is {here}",
+                where=where,
+                next=f"name a checkpoint with {here}, or let model.{part}.type be {there}; "
+                f"{_BY_FILE}",
+            )
 
 
 def _first_batches(
@@ -244,12 +257,22 @@ def _parts(dataset: Any) -> Iterator[Dataset]:
         yield described if uncached is None else Dataset.adapt(uncached())
 
 
-def _related(theirs: str, ours: str) -> bool:
-    """Whether one class is the other, or inherits it."""
-    if theirs.rpartition(":")[2] == ours.rpartition(":")[2]:
+def _related(theirs: Any, ours: Any, key: str) -> bool:
+    """Whether the class of one table is that of the other, or inherits it; or one says none."""
+    if not isinstance(theirs, Mapping) or not isinstance(ours, Mapping):
         return True
+    names = theirs.get("type"), ours.get("type")
+    if not all(isinstance(name, str) for name in names):
+        return True
+    if _class_name(theirs) == _class_name(ours):
+        return True
+    registry = BY_NAME[SLOTS[key]]
     try:
-        one, other = VLAS.get(theirs), VLAS.get(ours)
+        one, other = (registry.get(name) for name in names)
     except PluginError:
         return True  # it says so where the model is built
     return issubclass(one, other) or issubclass(other, one)
+
+
+def _class_name(table: Mapping[str, Any]) -> str:
+    return str(table.get("type")).rpartition(":")[2]

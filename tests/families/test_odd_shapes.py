@@ -17,7 +17,6 @@ pytest.importorskip("pyarrow")
 
 from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
-
 from fluxvla_core.plugins.registry import load_plugin_files
 
 from .tiny import HORIZON, tiny
@@ -62,9 +61,7 @@ def recorded(root: Path, odd_robot: Any, cameras: int) -> Path:
             frames = (each[name.rpartition(".")[2]] for each in seen)
             stored = [cv2.imencode(".png", image[..., ::-1])[1].tobytes() for image in frames]
             rows = [{"bytes": data, "path": None} for data in stored]
-            columns[name] = pa.array(
-                rows, pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-            )
+            columns[name] = pa.array(rows, kind)
         file = root / f"data/chunk-000/episode_{episode:06d}.parquet"
         file.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.table(columns), file)

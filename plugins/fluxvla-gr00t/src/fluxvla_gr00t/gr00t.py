@@ -31,11 +31,11 @@ class GR00T(VLA, nn.Module):
         vla_head: table or module; its ``context_dim`` is filled in here.
         freeze_vlm_backbone: train the head alone, as NVIDIA's fine-tuning does by default.
         embodiment_id: the embodiment of batches that do not say theirs.
+        pretrained_name_or_path: weights that a training starts from, for instance a published
+            checkpoint's folder.
         prefix_conditioning: chunks that continue another are trained for and made by holding their
             beginning (Black et al. 2025, arXiv 2512.05964); without, they are made by guidance.
             Training takes ``prefix_len`` of ``SamplePrefixLength`` then.
-        pretrained_name_or_path: weights that a training starts from, for instance a published
-            checkpoint's folder.
     """
 
     input_sizes = InputSizes(
@@ -53,8 +53,8 @@ class GR00T(VLA, nn.Module):
         vla_head: Mapping[str, Any] | nn.Module,
         freeze_vlm_backbone: bool = True,
         embodiment_id: int = 0,
-        prefix_conditioning: bool = False,
         pretrained_name_or_path: str | None = None,
+        prefix_conditioning: bool = False,
     ) -> None:
         super().__init__()
         self.pretrained_name_or_path = pretrained_name_or_path

@@ -12,6 +12,7 @@ from fluxvla_gr00t.image_tokens import image_token_of
 from fluxvla_gr00t.qwen3_vl import Qwen3VLBackbone
 
 from fluxvla_core.errors import ConfigError
+from tests.training.adapters import OWN, adapted, shipped
 
 from .gr00t_sizes import PLACE, TINY_HEAD, TINY_N15, TINY_N17, published, tiny
 from .test_gr00t_parity import batch, to_act
@@ -298,3 +299,12 @@ def test_the_old_name_of_image_token_still_works():
         token = image_token_of("EagleBackbone", 7, 9, 10)
     assert token == 9
     assert image_token_of("EagleBackbone", 7, None, 10) == 7
+
+
+@pytest.mark.parametrize(
+    ("version", "config"),
+    [("n1.5", "gr00t_n15_aloha_lora.py"), ("n1.7", "gr00t_n17_libero_lora.py")],
+)
+def test_the_models_own_lora_layers_are_those_of_the_config(version, config):
+    pytest.importorskip("peft")
+    assert adapted(tiny(version), OWN) == adapted(tiny(version), shipped(config))

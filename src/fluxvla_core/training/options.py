@@ -6,10 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fluxvla_core.build import RunContext
+from fluxvla_core.build import RunContext, class_of
 from fluxvla_core.config.resolve import LOADER_KEYS
 from fluxvla_core.config.similar_keys import similar_key
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.training.lora import LoraOptions, check_installed, is_count, is_positive
 from fluxvla_core.training.optimizers import make_schedule
 
@@ -178,7 +181,9 @@ class TrainOptions:
             return None
         where = context.where(f"{context.section}.lora")
         check_installed(where)
-        return LoraOptions.read(self.lora, where)
+        table = context.config.get("model")
+        kind = class_of(table.get("type"), VLAS) if isinstance(table, Mapping) else type(table)
+        return LoraOptions.read(self.lora, where, implements(kind, VLA, "lora_defaults"))
 
     @property
     def save_steps(self) -> int | None:

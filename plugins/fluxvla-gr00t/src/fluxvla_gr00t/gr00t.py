@@ -175,6 +175,12 @@ class GR00T(VLA, nn.Module):
         """``(T, D)`` of a chunk, and of the noise that one starts from."""
         return self.vla_head.horizon, self.vla_head.action_dim
 
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """The attention of the action head, as NVIDIA's fine-tuning has it."""
+        layers = r"vla_head\.(dit\.blocks|context_blocks)\.\d+\.attention\.(query|key|value)"
+        return {"target_modules": layers}
+
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
         return [*self.vlm_backbone.fsdp_units(), *self.vla_head.fsdp_units()]

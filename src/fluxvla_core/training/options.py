@@ -76,8 +76,8 @@ class TrainOptions:
     """weights to start from: a checkpoint's folder, a work dir, a safetensors file; a run that goes
     on has its own, or its adapter's base, instead."""
     lora: LoraOptions | Mapping[str, Any] | None = None
-    """train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
-    ``alpha``, ``dropout``, ``modules_to_save``."""
+    """train low-rank adapters only: table of ``rank`` and, if wanted, ``target_modules``,
+    ``modules_to_save`` (both are the model's own by default), ``alpha``, ``dropout``."""
     ema_decay: float | None = None
     """decay of averaged weights (EMA), which are kept too and used for inference; None: none."""
     val_iter_interval: int | None = None

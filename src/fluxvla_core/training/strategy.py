@@ -68,7 +68,7 @@ class Strategy(TrainRunner):
     resume_checkpoint: Checkpoint | None = None
     """The checkpoint that the run resumes from; None for a fresh start."""
     val_dataset: Any = None
-    """The dataset of ``val_dataloader``; where nobody has set it, ``run`` builds it."""
+    """The dataset of ``val_dataloader``, if it was built before ``run``, which builds it else."""
     # Known inside run().
     dataset: Any = None
     plan: StepPlan

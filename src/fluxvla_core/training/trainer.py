@@ -96,9 +96,9 @@ class Trainer:
         if runner.val_options is None:
             return None
         seed = runner.options.seed
-        if runner.val_dataset is None:
-            runner.val_dataset = validation_dataset(runner.context, dataset, seed)
         held_out = runner.val_dataset
+        if held_out is None:
+            held_out = validation_dataset(runner.context, dataset, seed)
         takes = observations_of(runner.model)
         check_observations(takes, held_out, runner.context, "val_dataloader")
         return Validation(

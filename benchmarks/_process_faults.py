@@ -188,7 +188,7 @@ class Program:
 def _own_terminal() -> None:
     """In the new process: its input is its terminal, whose signals reach it.
 
-    Also where this process was started by nohup or in the background of a script, which ignore some.
+    Also where this process was started by nohup or in the background of a script.
     """
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP):

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from functools import cached_property, wraps
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -202,7 +203,7 @@ CHECKPOINTS: dict[str, tuple[Callable[[Files, str], object], str]] = {
     "no statistics of actions": (
         lambda files, entry: files[STATISTICS][entry].pop("action"),
         r"(the statistics have no entry 'action'; they have proprio|"
-        r"the statistics of 'action' lack q01, .*; they have nothing)",
+        r"the statistics of 'action' lack \w+, .*; they have nothing)",
     ),
     "a statistic that is needed is missing": (
         without("std", "q01", "min"),
@@ -213,7 +214,7 @@ CHECKPOINTS: dict[str, tuple[Callable[[Files, str], object], str]] = {
         r"the statistics have no '\w+'; they have other",
     ),
     "a robot of 13 joints": (
-        lambda files, _: files[EMBODIMENT]["joints"].pop(),
+        lambda files, _: files[EMBODIMENT].update(joints=files[EMBODIMENT]["joints"][:-1]),
         r"\b13\b.*the statistics.* \(?14\b",
     ),
     "chunks of 5": (
@@ -303,7 +304,7 @@ def test_a_checkpoint_of_a_robot_without_weights(
     assert "embodiment_ids are below 32, in the data one is 99" in refused(place)
 
 
-@pytest.mark.parametrize(("theirs", "ours"), zip(SHIPPED, [*list(SHIPPED)[1:], "pi0"], strict=True))
+@pytest.mark.parametrize(("theirs", "ours"), list(pairwise([*SHIPPED, "pi0"])))
 def test_a_training_does_not_start_from_another_family(
     theirs: str, ours: str, trained: Callable[[str], Trained], tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from fluxvla_core.plugins.registry import load_plugin_files
 
 from .tiny import HORIZON, tiny
 
+QUICK = (("act", 1), ("diffusion", 4))
 COLUMNS = 60
 LENGTH = 24
 PLUGIN = Path(__file__).with_name("odd_robot.py")
@@ -149,9 +151,12 @@ def odd(family: str, folder: Path, odd_robot: Any, cameras: int) -> Path:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="opens a pseudo-terminal")
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("cameras", [1, 4])
 @pytest.mark.parametrize(
-    "family", ["diffusion", pytest.param("llava", marks=pytest.mark.slow), "act"]
+    ("family", "cameras"),
+    [
+        pair if pair in QUICK else pytest.param(*pair, marks=pytest.mark.slow)
+        for pair in product(("llava", "act", "diffusion"), (1, 4))
+    ],
 )
 def test_a_robot_of_odd_shapes(family: str, cameras: int, odd_robot: Any, tmp_path: Path) -> None:
     from tests.cli.test_reporters import behind_a_terminal
@@ -178,5 +183,6 @@ def test_a_robot_of_odd_shapes(family: str, cameras: int, odd_robot: Any, tmp_pa
     (trace,) = (work / "inference").rglob("trace.jsonl")
     rows = [json.loads(line) for line in trace.read_text().splitlines()]
     sent = np.array([row["command"] for row in rows if row.get("event") == "command"])
-    assert sent.shape == (20, odd_robot.JOINTS)
+    assert sent.shape[1] == odd_robot.JOINTS
+    assert len(sent) >= 20  # and what brakes the arm
     assert np.isfinite(sent).all()

@@ -212,7 +212,9 @@ def test_the_models_own_lora_layers_are_those_of_the_config(folders) -> None:
 def test_every_adapter_of_the_models_own_layers_trains(folders, make) -> None:
     pytest.importorskip("peft")
     model = make(folders)
-    assert idle_parameters(model, OWN, batch_of()) == []
+    idle = idle_parameters(model, OWN, batch_of())
+    # The first layer's queries are zeros, which a norm's scale leaves as they are.
+    assert [name for name in idle if not name.endswith("decoder.layers.0.norm1.weight")] == []
     trained = {name for name, p in model.named_parameters() if p.requires_grad}
     assert any(".layers.1.mlp.down_proj.lora_" in name for name in trained)
     assert not any("vision" in name for name in trained)

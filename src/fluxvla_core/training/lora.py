@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
@@ -125,14 +125,18 @@ class LoraOptions:
     def for_model(self, model: nn.Module, where: str | None = None) -> LoraOptions:
         """With the layers that ``model`` names, where these options name none.
 
+        A module in ``modules_to_save`` that has another one of this name inside becomes that one.
+
         Raises:
-            ConfigError: it names none either.
+            ConfigError: the model names none either; or that other one is not all of the module.
         """
-        if self.target_modules is not None:
-            return self
-        own = VLA.adapt(model).lora_defaults
-        given = {k: v for k, v in vars(self).items() if v not in (None, ())}
-        return self.read({**own, **given}, where)
+        options = self
+        if self.target_modules is None:
+            own = VLA.adapt(model).lora_defaults
+            given = {k: v for k, v in vars(self).items() if v not in (None, ())}
+            options = self.read({**own, **given}, where)
+        saved = tuple(n for end in options.modules_to_save for n in _innermost(model, end, where))
+        return replace(options, modules_to_save=saved)
 
     def for_peft(self, base: str | None = None) -> dict[str, Any]:
         """``adapter_config.json`` as peft reads it; ``base`` is where the base weights are from."""
@@ -194,7 +198,8 @@ def attach(
     """
     from peft import LoraConfig, inject_adapter_in_model
 
-    options = options.for_model(model, where)
+    if not trained:
+        options = options.for_model(model, where)
     _check_found(model, options, where)
     if not trained:
         _check_unambiguous(model, options.modules_to_save, where)
@@ -226,6 +231,25 @@ def _check_found(model: nn.Module, options: LoraOptions, where: str | None) -> N
                     where=where,
                     next=f"the model has {_leaf_names(model)}",
                 )
+
+
+def _innermost(model: nn.Module, end: str, where: str | None) -> list[str]:
+    """``end``, or the whole names of the inner modules where modules of that name are nested.
+
+    peft wraps both, and then trains only a copy that the forward pass does not use.
+    """
+    hit = {name: module for name, module in model.named_modules() if _ends(name, end)}
+    nested = {n: inner for n in hit if (inner := [i for i in hit if _inside(i, n)])}
+    for name, inner in nested.items():
+        parts = [id(p) for i in inner for p in hit[i].parameters()]
+        if {id(p) for p in hit[name].parameters()} - set(parts):
+            raise ConfigError(
+                f"lora.modules_to_save: {end!r} hits {name!r} and, inside it, {_listed(inner)}",
+                where=where,
+                cause="peft would train a copy of the inner one that is not used",
+                next=f"name the parts of {name!r} that are to be trained",
+            )
+    return [name for name in hit if name not in nested] if nested else [end]
 
 
 def _check_unambiguous(model: nn.Module, saved: Sequence[str], where: str | None) -> None:

@@ -210,6 +210,7 @@ def check_family(place: str, table: Any) -> None:
 
     if place.endswith(".safetensors") or place.startswith(HUB) or not isinstance(table, Mapping):
         return  # what the hub has is fetched by one process, when weights are read
+    model: Any
     if is_foreign(place):
         model, where = read_foreign(place).model, str(foreign_folder(place))
     else:
@@ -261,8 +262,8 @@ def _related(theirs: Any, ours: Any, key: str) -> bool:
     """Whether the class of one table is that of the other, or inherits it; or one says none."""
     if not isinstance(theirs, Mapping) or not isinstance(ours, Mapping):
         return True
-    names = theirs.get("type"), ours.get("type")
-    if not all(isinstance(name, str) for name in names):
+    names = [name for name in (theirs.get("type"), ours.get("type")) if isinstance(name, str)]
+    if len(names) < 2:
         return True
     if _class_name(theirs) == _class_name(ours):
         return True
@@ -274,5 +275,5 @@ def _related(theirs: Any, ours: Any, key: str) -> bool:
     return issubclass(one, other) or issubclass(other, one)
 
 
-def _class_name(table: Mapping[str, Any]) -> str:
+def _class_name(table: Any) -> str:
     return str(table.get("type")).rpartition(":")[2]

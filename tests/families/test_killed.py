@@ -23,9 +23,9 @@ from fluxvla_core.testing import training
 from .tiny import tiny
 
 FAMILIES = {
-    "pi0": "DDPTrainRunner",
+    "pi0": "FSDPTrainRunner",
     "pi05": "FSDPTrainRunner",
-    "pi0_fast": "DDPTrainRunner",
+    "pi0_fast": "FSDPTrainRunner",
     "gr00t_n15": "FSDPTrainRunner",
     "gr00t_n17": "DDPTrainRunner",
     "smolvla": "FSDPTrainRunner",

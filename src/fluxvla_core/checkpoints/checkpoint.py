@@ -1,7 +1,7 @@
 """A saved checkpoint as one object, and the checkpoints of a work dir as a list.
 
-Nothing here needs torch or a runner until weights are asked for: a command that lists checkpoints
-and a robot that reads an embodiment use the same door as the trainer.
+Nothing here imports torch before weights are read: commands that list checkpoints and robots that
+read an embodiment use these functions too.
 
     <work_dir>/checkpoints/step-000000100/
         manifest.json            sizes and SHA-256 of everything below

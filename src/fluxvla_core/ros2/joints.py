@@ -42,7 +42,7 @@ def _columns(sent: tuple[str, ...], count: int, names: tuple[str, ...], source: 
     if not sent:
         raise BadMessage(
             f"{source}: {count} positions without joint names; "
-            "joints are only ever told apart by name",
+            "joints are identified by name alone",
             next="let the driver fill JointState.name",
         )
     if count != len(sent):

@@ -31,7 +31,7 @@ from fluxvla_core.errors import (
 from fluxvla_core.plugins.registry import BY_NAME, VLAS
 
 _OBSERVATIONS = {"n_obs_steps": 1, "past_actions": 0}
-"""What a model takes that does not say."""
+"""Defaults for a model that does not declare them."""
 _WORDS = {
     "cameras": "the number of cameras",
     "image_size": "the size of images",

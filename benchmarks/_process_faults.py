@@ -186,9 +186,13 @@ class Program:
 
 
 def _own_terminal() -> None:
-    """In the new process: its input is its terminal, whose end it notices (under nohup, too)."""
+    """In the new process: its input is its terminal, whose signals reach it.
+
+    Also where this process was started by nohup or in the background of a script.
+    """
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 @contextmanager

@@ -18,14 +18,14 @@ TIMES = "FLUXVLA_BENCH_TIMES"
 """Names the file that a ``Timed`` arm writes."""
 
 
-def memory_mb() -> dict[str, float]:
-    """Memory of this process in MiB, of ``/proc/self/smaps_rollup`` (proc(5)).
+def memory_mb(process: int | str = "self") -> dict[str, float]:
+    """Memory of a process in MiB, of ``/proc/<process>/smaps_rollup`` (proc(5)).
 
     Returns:
         ``resident``: all that is mapped and in memory; ``proportional``: of what n processes share,
         each counts the n-th part; ``private``: what no other process has mapped.
     """
-    lines = Path("/proc/self/smaps_rollup").read_text(encoding="ascii").splitlines()[1:]
+    lines = Path(f"/proc/{process}/smaps_rollup").read_text(encoding="ascii").splitlines()[1:]
     kib = {name: int(value.split()[0]) for name, value in (line.split(":") for line in lines)}
     sums = {
         "resident": kib["Rss"],

@@ -88,10 +88,12 @@ FRAME_BYTES = 3 * 480 * 640 * 3
 
 
 class Memory:
-    """This process's private memory, looked at twice a second."""
+    """Private memory of this process and of its control process, looked at twice a second."""
 
     def __init__(self) -> None:
         self.seen: list[float] = [memory_mb()["private"]]
+        self.control: list[float] = []
+        self._children: list[int] = []
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._look, daemon=True)
         self._thread.start()
@@ -99,17 +101,45 @@ class Memory:
     def _look(self) -> None:
         while not self._over.wait(0.5):
             self.seen.append(memory_mb()["private"])
+            try:
+                self.control += [memory_mb(pid)["private"] for pid in self._children]
+            except OSError:  # it has ended, as the run soon will
+                continue
+            self._children = self._children or control_processes()
 
     def summary(self) -> dict[str, float]:
         """MiB: more at its most than at the start; growth per minute over the last two thirds."""
         self._over.set()
-        late = np.array(self.seen[len(self.seen) // 3 :])
-        slope = np.polyfit(np.arange(len(late)), late, 1)[0] * 120 if len(late) > 2 else 0.0
-        return {
+        self._thread.join()
+        found = {
             "at_start_mb": round(self.seen[0], 1),
             "more_mb": round(max(self.seen) - self.seen[0], 1),
-            "grows_mb_per_minute": round(float(slope), 2),
+            "grows_mb_per_minute": per_minute(self.seen),
         }
+        if self.control:
+            found["control_grows_mb_per_minute"] = per_minute(self.control)
+        return found
+
+
+def per_minute(seen: list[float]) -> float:
+    """The slope of the last two thirds of what was seen twice a second."""
+    late = np.array(seen[len(seen) // 3 :])
+    slope = np.polyfit(np.arange(len(late)), late, 1)[0] * 120 if len(late) > 2 else 0.0
+    return round(float(slope), 2)
+
+
+def control_processes() -> list[int]:
+    """The control process of this one, if it has one just now."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+            parent = (folder / "stat").read_text(encoding="ascii").rpartition(")")[2].split()[1]
+        except OSError:
+            continue  # it has ended
+        if parent == str(os.getpid()) and b"fluxvla_core.robot.process" in words:
+            found.append(int(folder.name))
+    return found
 
 
 def drive() -> Driver:

@@ -60,6 +60,7 @@ _STEERING = re.compile(
 )
 
 _LISTED = 200  # problems of a config
+_QUOTED = 100  # characters of a text
 
 EndReason = Literal["stopped", "rank lost", "work dir lost"]
 
@@ -132,6 +133,11 @@ def printable(text: str) -> str:
     Names and messages may come from untrusted files.
     """
     return _STEERING.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def quoted(text: str) -> str:
+    """``text`` in quotes, for a message; of a long one the beginning."""
+    return repr(text if len(text) <= _QUOTED else f"{text[:_QUOTED]}…")
 
 
 def nearest(name: str, names: Iterable[str], least: float = 0.6) -> str | None:

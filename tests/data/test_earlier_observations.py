@@ -13,7 +13,7 @@ from fluxvla_core.data.mixture import DistributedRepeatingDataset
 from fluxvla_core.data.sampler import StepPlan, StepSampler
 from fluxvla_core.data.transforms.images import normalized
 from fluxvla_core.errors import ConfigError, DataError
-from fluxvla_core.training.input_sizes import check_observations
+from fluxvla_core.training.fit_checks import check_observations
 
 STARTS = (0, 7, 19)
 SIZED = {"type": "ResizeImages", "height": 16, "width": 24}

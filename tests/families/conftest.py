@@ -11,7 +11,7 @@ from fluxvla_core.cli.main import main
 from .tiny import CAMERAS, HEIGHT, WIDTH
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("data") / "aloha"
     sizes = ["--height", str(HEIGHT), "--width", str(WIDTH)]

@@ -23,10 +23,18 @@ from fluxvla_core.testing import training
 from .tiny import tiny
 
 FAMILIES = {
+    "pi0": "DDPTrainRunner",
     "pi05": "FSDPTrainRunner",
-    "smolvla": "FSDPTrainRunner",
+    "pi0_fast": "DDPTrainRunner",
+    "gr00t_n15": "FSDPTrainRunner",
     "gr00t_n17": "DDPTrainRunner",
+    "smolvla": "FSDPTrainRunner",
+    "openvla": "FSDPTrainRunner",
     "openvla_oft": "DDPTrainRunner",
+    "compact": "DDPTrainRunner",
+    "llava": "FSDPTrainRunner",
+    "act": "FSDPTrainRunner",
+    "diffusion": "DDPTrainRunner",
 }
 STEPS, INTERVAL = 40, 10
 

@@ -143,6 +143,7 @@ def test_weights_of_another_family(
             said = capsys.readouterr().err
             assert "the checkpoint is of ACT, the config's model is DiffusionPolicy" in said
     assert not calls
+    assert not (tmp_path / "work").exists()
 
 
 def test_all_that_does_not_fit_is_listed_at_once(
@@ -157,6 +158,42 @@ def test_all_that_does_not_fit_is_listed_at_once(
     assert "2 problems in the config" in said
     assert CAMERAS in said
     assert CHUNK.format(8) in said
+
+
+HELD_OUT = [
+    ("act", {"img_keys": ["top"]}, "act.py:1: model.num_cameras: ACT: the number of cameras is 2, "
+     "in the validation data it is 1"),
+    ("diffusion", {"n_obs_steps": 1}, "diffusion.py:6: val_dataloader.dataset.n_obs_steps: "
+     f"{OBSERVATIONS}"),
+    ("gr00t_n17", {"embodiment_id": 99}, "GR00T: embodiment_ids are below 32, in the validation "
+     "data one is 99"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("family", "change", "words"), HELD_OUT)
+def test_validation_data_that_do_not_fit(
+    family: str,
+    change: dict[str, Any],
+    words: str,
+    data: Path,
+    tmp_path: Path,
+    built: Any,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tiny(family, tmp_path, data)
+    table = load_config(config).tree["train_dataloader"]["dataset"]
+    with config.open("a") as file:
+        file.write(f"val_dataloader = {{'dataset': { ({**table, **change})!r}}}\n")
+    calls = built(config)
+    command = ["run", "--config", str(config), "--section", "runner", "--set", WINDOW]
+    for more in (["--work-dir", str(tmp_path / "work")], ["--dry-run"]):
+        assert main([*command, *more]) == 2
+        said = capsys.readouterr().err
+        assert words in said
+        assert CHUNK.format(8) in said
+        assert "2 problems in the config" in said
+    assert not calls
+    assert not (tmp_path / "work").exists()
 
 
 def test_images_that_no_transform_normalises(

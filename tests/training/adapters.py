@@ -20,6 +20,10 @@ def shipped(config: str) -> LoraOptions:
     return LoraOptions.read({**table, "rank": 2}, None)
 
 
+OWN = LoraOptions.read({"rank": 2}, None, declared=True)
+"""With the layers that the model names."""
+
+
 def idle_parameters(model: nn.Module, options: LoraOptions, batch: dict[str, Tensor]) -> list[str]:
     """Parameters that should train and get no gradient in the second of two steps.
 
@@ -35,3 +39,9 @@ def idle_parameters(model: nn.Module, options: LoraOptions, batch: dict[str, Ten
         loss.backward()
         optimizer.step()
     return [n for n, p in trained.items() if p.grad is None or not p.grad.any()]
+
+
+def adapted(model: nn.Module, options: LoraOptions) -> set[str]:
+    """Names of what an adapter of ``options`` trains."""
+    attach(model, options)
+    return {name for name, p in model.named_parameters() if p.requires_grad}

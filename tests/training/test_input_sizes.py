@@ -10,15 +10,8 @@ import pytest
 from fluxvla_core import HEADS, VISION_BACKBONES, VLAS, RunContext
 from fluxvla_core.errors import CheckpointError, ConfigError
 from fluxvla_core.models import VLA, InputSizes
-from fluxvla_core.training.input_sizes import (
-    Declared,
-    check_data,
-    check_family,
-    chunk_of,
-    declared_sizes,
-    misfits,
-    observations_in,
-)
+from fluxvla_core.training.fit_checks import check_data, check_family, observations_in
+from fluxvla_core.training.input_sizes import Declared, chunk_of, declared_sizes, misfits
 
 torch = pytest.importorskip("torch")
 
@@ -180,7 +173,7 @@ def stack(samples):
 
 
 def context(**table):
-    origins = {"model": "a.py:3", "model.state_dim": "a.py:4"}
+    origins = {"model": "a.py:3", "model.state_dim": "a.py:4", "val_dataloader.dataset": "a.py:7"}
     return RunContext(config={"model": {**TABLE, **table}}, section="runner", origins=origins)
 
 
@@ -207,11 +200,26 @@ def test_other_observations_than_the_models():
         check_data(context(), Data(n_obs_steps=2), stack)
 
 
-def checkpoint(folder, kind):
+def test_validation_data_are_compared_too_and_all_that_does_not_fit_is_listed_at_once():
+    check_data(context(), Data(), stack, Data())
+    with pytest.raises(ConfigError) as error:
+        check_data(context(), Data(5), stack, Data(datasets=[Data(4, n_obs_steps=2), Data(4)]))
+    assert [str(problem) for problem in error.value.problems] == [
+        "a.py:4: model.state_dim: Sized: the width of states is 6, in the data it is 5",
+        "a.py:7: val_dataloader.dataset.n_obs_steps: n_obs_steps of the model is 1, that of the "
+        "dataset 2",
+        "a.py:4: model.state_dim: Sized: the width of states is 6, in the validation data it is 4",
+    ]
+    assert error.value.next.count("those that a transform pads them to") == 1
+    assert "--set val_dataloader.dataset.n_obs_steps=1" in error.value.next
+
+
+def checkpoint(folder, kind, **parts):
     from fluxvla_core.checkpoints.writer import CheckpointWriter
 
     with CheckpointWriter(folder, 1, 0) as writer:
-        config = {"format": "fluxvla-config-1", "config": {"model": {"type": kind}}, "origins": {}}
+        tree = {"model": {"type": kind, **parts}}
+        config = {"format": "fluxvla-config-1", "config": tree, "origins": {}}
         writer.write_json("config.resolved.json", config)
         return writer.commit()
 
@@ -226,4 +234,23 @@ def test_a_checkpoint_of_another_family(tmp_path):
 @pytest.mark.parametrize("kind", ["Sized", "some-plugin:Sized", "BaseSized", "NotInstalled"])
 def test_a_checkpoint_of_the_same_family_or_of_an_unknown_one(tmp_path, kind):
     checkpoint(tmp_path, kind)
+    check_family(str(tmp_path), TABLE)
+
+
+def test_a_checkpoint_of_the_same_class_with_another_part(tmp_path):
+    path = checkpoint(tmp_path, "Sized", vla_head={"type": "Seeing"})
+    words = "the vla_head of the checkpoint's Sized is Seeing, that of the config's model is Head"
+    HEADS.register_module()(Seeing)
+    try:
+        with pytest.raises(CheckpointError, match=words) as error:
+            check_family(str(tmp_path), TABLE)
+    finally:
+        HEADS.unregister("Seeing")
+    assert error.value.where == str(path)
+    assert "let model.vla_head.type be Seeing" in error.value.next
+
+
+@pytest.mark.parametrize("part", [{"type": "NotInstalled"}, {"type": "some-plugin:Head"}, None])
+def test_a_part_of_the_same_class_or_of_an_unknown_one(tmp_path, part):
+    checkpoint(tmp_path, "Sized", vla_head=part)
     check_family(str(tmp_path), TABLE)

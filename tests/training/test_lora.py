@@ -391,6 +391,78 @@ def test_a_regular_expression_and_the_default_alpha(tmp_path):
     load_for_inference(TinyVLA(), latest(tmp_path))
 
 
+@pytest.fixture
+def naming(monkeypatch):
+    """The model names layers itself."""
+    own = {"target_modules": ["linear"], "modules_to_save": ["head"]}
+    monkeypatch.setattr(TinyVLA, "lora_defaults", own, raising=False)
+
+
+def test_a_model_may_name_the_layers(tmp_path, naming):
+    short = {"rank": 2, "alpha": 4}
+    run(tmp_path / "own", lora=short, max_steps=4)
+    run(tmp_path / "named", lora=LORA, max_steps=4)
+    own, named = (latest(tmp_path / name) for name in ("own", "named"))
+    assert LoraOptions.of_checkpoint(own) == LoraOptions.of_checkpoint(named)
+    found, expected = (one.tensors(lora.WEIGHTS) for one in (own, named))
+    assert found.keys() == expected.keys()
+    assert all(torch.equal(found[name], expected[name]) for name in found)
+    assert run(tmp_path / "own", "auto", lora=short).progress.step == 6
+    load_for_inference(TinyVLA(), latest(tmp_path / "own"))
+
+
+def test_names_of_the_config_replace_those_of_the_model(naming):
+    given = LoraOptions.read({"rank": 2, "target_modules": ["head"]}, None)
+    assert given.for_model(TinyVLA()) == given
+    more = LoraOptions.read({"rank": 2, "modules_to_save": ["blocks.0"]}, None, declared=True)
+    found = more.for_model(TinyVLA())
+    assert (found.target_modules, found.modules_to_save) == (("linear",), ("blocks.0",))
+
+
+class Nested(torch.nn.Module):
+    """Its projector is a module with a projector inside."""
+
+    def __init__(self, whole=True):
+        super().__init__()
+        self.linear, self.projector = torch.nn.Linear(3, 3), torch.nn.Module()
+        self.projector.projector = torch.nn.Linear(3, 3)
+        if not whole:
+            self.projector.norm = torch.nn.LayerNorm(3)
+
+    def forward(self, x):
+        return self.projector.projector(self.linear(x))
+
+
+NESTED = LoraOptions(2, ("linear",), modules_to_save=("projector",))
+
+
+def test_a_module_with_one_of_its_name_inside_is_trained():
+    """peft wraps both, and its outer copy, which is used, stays as it is."""
+    model = Nested()
+    options = NESTED.for_model(model)
+    assert options.modules_to_save == ("projector.projector",)
+    assert options.for_model(model) == options
+    lora.attach(model, NESTED)
+    model(torch.ones(2, 3)).sum().backward()
+    trained = {n: p.grad for n, p in model.named_parameters() if p.requires_grad}
+    assert {n for n in trained if "projector" in n} == {
+        f"projector.projector.modules_to_save.default.{name}" for name in ("weight", "bias")
+    }
+    assert all(grad is not None for grad in trained.values())
+
+
+def test_a_module_that_is_more_than_the_one_inside_is_refused():
+    words = "'projector' hits 'projector' and, inside it, projector.projector"
+    with pytest.raises(ConfigError, match=words):
+        lora.attach(Nested(whole=False), NESTED)
+
+
+def test_options_for_a_model_that_names_none():
+    options = LoraOptions.read({"rank": 2}, None, declared=True)
+    with pytest.raises(ConfigError, match=r"a\.py:3: runner\.lora: lora needs 'target_modules'"):
+        lora.attach(TinyVLA(), options, "a.py:3: runner.lora")
+
+
 def test_without_peft(tmp_path, monkeypatch):
     import importlib.util
 

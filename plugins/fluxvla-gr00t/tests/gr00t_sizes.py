@@ -88,10 +88,20 @@ def published(version: str) -> GR00T:
         return GR00T(**VERSIONS[version][0])
 
 
-def tiny(version: str, freeze_vlm_backbone: bool = False, **head: object) -> GR00T:
+def tiny(
+    version: str,
+    freeze_vlm_backbone: bool = False,
+    prefix_conditioning: bool = False,
+    **head: object,
+) -> GR00T:
     """A tiny model whose weights follow from their published names."""
     table = VERSIONS[version][1]
-    model = GR00T(table["vlm_backbone"], {**table["vla_head"], **head}, freeze_vlm_backbone)
+    model = GR00T(
+        table["vlm_backbone"],
+        {**table["vla_head"], **head},
+        freeze_vlm_backbone,
+        prefix_conditioning=prefix_conditioning,
+    )
     filled = {
         name: torch.from_numpy(fill.weight(published_name(name, version), value.shape))
         for name, value in model.state_dict().items()

@@ -12,6 +12,7 @@ from fluxvla_gr00t.image_tokens import image_token_of
 from fluxvla_gr00t.qwen3_vl import Qwen3VLBackbone
 
 from fluxvla_core.errors import ConfigError
+from tests.training.adapters import OWN, adapted, shipped
 
 from .gr00t_sizes import PLACE, TINY_HEAD, TINY_N15, TINY_N17, published, tiny
 from .test_gr00t_parity import batch, to_act
@@ -129,6 +130,103 @@ def test_a_guided_chunk_follows_the_paper(version):
 
 
 @pytest.mark.parametrize("version", VERSIONS)
+def test_a_prefix_of_no_actions_changes_nothing(version):
+    inputs, none = batch(version), torch.zeros(2, 1, dtype=torch.int64)
+    with torch.no_grad():
+        free = tiny(version)(**inputs)["loss"]
+        found = tiny(version, prefix_conditioning=True)(**inputs, prefix_len=none)["loss"]
+    torch.testing.assert_close(found, free)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_actions_of_a_prefix_are_given_without_noise_and_not_counted(version):
+    model = tiny(version, prefix_conditioning=True)
+    inputs, length = batch(version), torch.tensor([[2, 0], [5, 1]])
+    inputs["noise"] = torch.cat([inputs["noise"], inputs["noise"].flip(0)], dim=1)
+    inputs["time"] = torch.cat([inputs["time"], inputs["time"] / 2], dim=1)
+    given = torch.arange(6) < length[..., None]
+    total = 0.0
+    with torch.no_grad():
+        found = model(**inputs, prefix_len=length)
+        other = {**inputs, "noise": torch.where(given[..., None], 9.0, inputs["noise"])}
+        torch.testing.assert_close(model(**other, prefix_len=length)["loss"], found["loss"])
+        # By hand: a time for every token, and errors of what is not given over all.
+        head, ids, clean = model.vla_head, inputs["embodiment_ids"], inputs["actions"]
+        seen = (inputs["images"], inputs["lang_tokens"], inputs["lang_masks"], None)
+        context = head.encode_context(model.vlm_backbone(*seen))
+        state = head.encode_states(inputs["states"], ids)
+        for k in range(2):
+            time, noise = inputs["time"][:, k], inputs["noise"][:, k]
+            t = torch.where(given[:, k], 1.0, time[:, None])
+            x = torch.lerp(noise, clean, t[..., None])
+            velocity = velocity_by_hand(
+                head, x, (time * 1000).long(), given[:, k], context, state, ids
+            )
+            errors = (velocity - (clean - noise)).square() * ~given[:, k, :, None]
+            total += (errors * inputs["action_masks"][..., None]).sum().item()
+    assert found["loss"].item() == pytest.approx(total / (2 * 2 * 6 * 5), rel=1e-5)
+
+
+def velocity_by_hand(head, x, steps, given, context, state, ids):
+    """The published network, with what depends on the time computed token by token."""
+    each = torch.where(given, 1000, steps[:, None])
+    encoder = head.action_encoder
+    rows = [encoder(x[:, i : i + 1], each[:, i], ids) for i in range(x.shape[1])]
+    actions = torch.cat(rows, dim=1) + head.positions.weight[: x.shape[1]]
+    tokens = [state, actions]
+    if head.future_tokens is not None:
+        tokens.insert(1, head.future_tokens.weight.expand(len(x), -1, -1))
+    hidden = torch.cat(tokens, dim=1)
+    before = hidden.shape[1] - x.shape[1]
+    places = torch.cat([steps[:, None].expand(-1, before), each], dim=1)
+    times = [head.dit.time(places[:, i]) for i in range(hidden.shape[1])]
+    masks = head._masks(context)
+    for layer, block in enumerate(head.dit.blocks):
+        modulation = torch.stack([block.modulation(time) for time in times], dim=1)
+        scale, shift = modulation.chunk(2, dim=-1)
+        normal = torch.nn.functional.layer_norm(hidden, hidden.shape[-1:]) * (1 + scale) + shift
+        other, mask = (normal, None) if layer % 2 else (context.features, masks[layer // 2])
+        hidden = hidden + block.attention(normal, other, mask)
+        plain = torch.nn.functional.layer_norm(hidden, hidden.shape[-1:])
+        hidden = hidden + block.feed_forward(plain)
+    silu = torch.nn.functional.silu
+    last = torch.stack([head.dit.modulate(silu(time)) for time in times], dim=1)
+    shift, scale = last.chunk(2, dim=-1)
+    normal = torch.nn.functional.layer_norm(hidden, hidden.shape[-1:], eps=1e-6)
+    out = head.dit.out(normal * (1 + scale) + shift)
+    return head.action_decoder(out[:, -x.shape[1] :], ids)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_chunk_continues_by_its_prefix(version):
+    model, inputs = tiny(version, prefix_conditioning=True), to_act(batch(version))
+    old = torch.from_numpy(np.random.default_rng(0).normal(size=(2, 6, 5))).float()
+    more = {
+        "prev_actions": old,
+        "prefix_weights": torch.ones(2, 6),
+        "prefix_len": torch.tensor([2, 0]),
+        "max_guidance_weight": torch.full((2,), 5.0),
+    }
+    with torch.no_grad():
+        found = model.predict_action(**inputs, **more)
+        free = model.predict_action(**inputs)
+        later = {**more, "prev_actions": old.clone()}
+        later["prev_actions"][0, 2:] = 9.0
+        assert torch.equal(model.predict_action(**inputs, **later), found)
+    assert torch.equal(found[0, :2], old[0, :2])
+    torch.testing.assert_close(found[1], free[1], rtol=1e-5, atol=1e-5)
+    assert not torch.allclose(found[0, 2:], free[0, 2:])
+
+
+def test_prefixes_and_the_model_belong_together():
+    inputs, length = batch("n1.5"), torch.zeros(2, 1, dtype=torch.int64)
+    with pytest.raises(ConfigError, match="prefix_conditioning is True, and the batch has no"):
+        tiny("n1.5", prefix_conditioning=True)(**inputs)
+    with pytest.raises(ConfigError, match="prefix_conditioning is False, and the batch has a"):
+        tiny("n1.5")(**inputs, prefix_len=length)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
 def test_units_to_shard_are_disjoint_and_hold_most_weights(version):
     model = published(version)
     seen = [id(p) for unit in model.fsdp_units() for p in unit.parameters()]
@@ -201,3 +299,12 @@ def test_the_old_name_of_image_token_still_works():
         token = image_token_of("EagleBackbone", 7, 9, 10)
     assert token == 9
     assert image_token_of("EagleBackbone", 7, None, 10) == 7
+
+
+@pytest.mark.parametrize(
+    ("version", "config"),
+    [("n1.5", "gr00t_n15_aloha_lora.py"), ("n1.7", "gr00t_n17_libero_lora.py")],
+)
+def test_the_models_own_lora_layers_are_those_of_the_config(version, config):
+    pytest.importorskip("peft")
+    assert adapted(tiny(version), OWN) == adapted(tiny(version), shipped(config))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +17,7 @@ from fluxvla_models.llava_action_head import LlavaActionHead
 from safetensors.torch import load_file, save_file
 
 from fluxvla_core.errors import ConfigError
-from tests.policies.refused import change_json, import_refused
+from tests.policies.refused import change_json, checked_with_transformers, import_refused
 
 from .test_lerobot_format import ACT_FOLDER, DIFFUSION_FOLDER, weights
 from .test_trained_alike import TABLES
@@ -103,3 +105,11 @@ def test_parts_refuse_another_width():
         chunks.errors(
             torch.zeros(1, 8), actions, torch.ones(1, 4), actions[:, None], torch.zeros(1, 1)
         )
+
+
+@pytest.mark.parametrize("name", ["llava_aloha", "aloha_sim_transfer"])
+def test_another_version_of_transformers(tmp_path, name):
+    config = Path(__file__).parents[3] / "configs" / f"{name}.py"
+    said = checked_with_transformers("4.40.0", config, tmp_path)
+    assert re.search(rf"{name}\.py:\d+: model\.type: fluxvla-models", said)
+    assert "needs transformers>=4.56,<6, but 4.40.0 is installed" in said

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,9 +10,12 @@ from fluxvla_models.conv_encoder import ConvEncoder, SpatialSoftmax
 from fluxvla_models.flow_matching_head import FlowMatchingHead
 from fluxvla_models.sentence_encoder import MINILM, SentenceEncoder
 
+from fluxvla_core import build_vla_from_cfg
+from fluxvla_core.config.load import load_config
 from fluxvla_core.data import resolve_model_path
 from fluxvla_core.errors import ConfigError
 
+ROOT = Path(__file__).parents[3]
 SMALL = {
     "vision_backbone": {"type": "ConvEncoder", "image_size": (32, 48), "channels": (8, 8, 16)},
     "llm_backbone": {"type": "SentenceEncoder"},
@@ -168,6 +172,25 @@ def test_the_text_encoder_is_frozen_and_stays_in_evaluation_mode(model):
     assert not any(p.requires_grad for p in model.llm_backbone.parameters())
     assert not model.llm_backbone.encoder.training
     assert model.vla_head.training
+
+
+def test_it_has_as_many_parameters_as_its_pages_say():
+    table = load_config(ROOT / "configs" / "aloha_sim_transfer.py").tree["model"]
+    with torch.device("meta"):
+        built = build_vla_from_cfg(table)
+    count = {True: 0, False: 0}
+    for parameter in built.parameters():
+        count[parameter.requires_grad] += parameter.numel()
+    trained, frozen = count[True], count[False]
+    assert frozen == sum(p.numel() for p in built.llm_backbone.parameters())
+    models = " ".join((ROOT / "docs" / "models.md").read_text().split())
+    assert f"| CompactVLA | {trained + frozen:,} |" in models
+    assert f"{frozen:,} are those of its frozen sentence encoder; {trained:,} are trained" in models
+    short, rest = f"{trained / 1e6:.1f} million", f"{frozen / 1e6:.1f} million"
+    for text in ((Path(__file__).parents[1] / "README.md").read_text(), str(CompactVLA.__doc__)):
+        said = " ".join(text.split())
+        assert short in said
+        assert f"frozen sentence encoder of {rest}" in said
 
 
 def test_units_to_shard_are_disjoint_and_trainable(model):

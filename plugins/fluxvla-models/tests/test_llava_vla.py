@@ -20,6 +20,7 @@ from tokenizers.pre_tokenizers import Whitespace
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 from tests.policies.benched import WHOLE, stages_measured
+from tests.training.adapters import OWN, adapted, idle_parameters, shipped
 
 from .llava_parts import HEAD, asked, batch_of, folders, halves, whole
 
@@ -199,3 +200,21 @@ def test_its_latency_is_measured(folders: dict[str, str], tmp_path: Path) -> Non
     config.write_text(f"model = {model!r}\ntrain_dataloader = dict(dataset={dataset!r})\n")
     options = ["--config", str(config), "--embodiment", str(tmp_path)]
     assert stages_measured(options, tmp_path / "measured") == WHOLE
+
+
+def test_the_models_own_lora_layers_are_those_of_the_config(folders) -> None:
+    pytest.importorskip("peft")
+    found = adapted(halves(folders), OWN)
+    assert found == adapted(halves(folders), shipped("llava_aloha_lora.py"))
+
+
+@pytest.mark.parametrize("make", [halves, whole])
+def test_every_adapter_of_the_models_own_layers_trains(folders, make) -> None:
+    pytest.importorskip("peft")
+    model = make(folders)
+    idle = idle_parameters(model, OWN, batch_of())
+    # The first layer's queries are zeros, which a norm's scale leaves as they are.
+    assert [name for name in idle if not name.endswith("decoder.layers.0.norm1.weight")] == []
+    trained = {name for name, p in model.named_parameters() if p.requires_grad}
+    assert any(".layers.1.mlp.down_proj.lora_" in name for name in trained)
+    assert not any("vision" in name for name in trained)

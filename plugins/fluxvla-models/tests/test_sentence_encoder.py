@@ -47,3 +47,9 @@ def test_it_is_built_and_called_without_memory() -> None:
     shapes = {name: (p.shape, p.dtype) for name, p in real.named_parameters()}
     assert {name: (p.shape, p.dtype) for name, p in bare.named_parameters()} == shapes
     assert (found.shape, found.dtype) == ((3, real.out_dim), torch.float32)
+
+
+def test_more_tokens_than_it_has_positions_for() -> None:
+    tokens = torch.ones(1, 513, dtype=torch.long)
+    with pytest.raises(ConfigError, match="has 513 places for tokens, the encoder 512"):
+        SentenceEncoder()(tokens, tokens.bool())

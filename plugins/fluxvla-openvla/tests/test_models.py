@@ -7,6 +7,7 @@ from fluxvla_openvla.openvla import OpenVLA
 from fluxvla_openvla.openvla_oft import OpenVLAOFT
 
 from fluxvla_core.errors import ConfigError
+from tests.training.adapters import OWN, idle_parameters
 
 from . import tiny
 
@@ -243,3 +244,22 @@ def test_batches_that_do_not_fit():
     ):
         with pytest.raises(ConfigError, match=words):
             model(**{**batch, key: value})
+
+
+@pytest.mark.parametrize("head", [None, "l1", "diffusion"])
+def test_every_adapter_of_the_models_own_layers_trains(head):
+    pytest.importorskip("peft")
+    if head is None:
+        model = make(OpenVLA)
+        batch = {**observation(), "actions": torch.rand(2, 1, 7) * 2 - 1}
+    else:
+        model = make(OpenVLAOFT, head=head)
+        batch = oft_batch(model)
+    names = {name for name, _ in model.named_modules()}
+    assert idle_parameters(model, OWN, batch) == []
+    trained = {name for name, p in model.named_parameters() if p.requires_grad}
+    layers = {name.partition(".lora_")[0] for name in trained if ".lora_" in name}
+    assert layers <= names
+    assert ("language_model.lm_head" in layers) == (head is None)
+    assert not any(".blocks.2." in name for name in layers)  # the last, which is not used
+    assert any("action_head" in name for name in trained) == (head is not None)

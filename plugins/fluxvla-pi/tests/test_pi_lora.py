@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.training.adapters import idle_parameters, shipped
+from tests.training.adapters import OWN, adapted, idle_parameters, shipped
 
 from .oracles.pi_inputs import EXPERT, GEMMA
 from .tiny import fast_batch, fast_model, model_of, training_batch
@@ -26,8 +26,12 @@ def test_every_adapter_of_a_flow_matching_config_trains(family, config):
             if name.endswith(("dense.weight", "dense.bias")):
                 parameter.normal_(std=0.5)
     assert idle_parameters(model, shipped(config), training_batch()) == []
+    own = adapted(model_of(family, **DEEP), OWN)
+    assert own == {name for name, p in model.named_parameters() if p.requires_grad}
 
 
 def test_every_adapter_of_pi0_fasts_config_trains():
     model = fast_model(variant={**GEMMA, "depth": DEPTH})
     assert idle_parameters(model, shipped("pi0_fast_libero_lora.py"), fast_batch()) == []
+    own = adapted(fast_model(variant={**GEMMA, "depth": DEPTH}), OWN)
+    assert own == {name for name, p in model.named_parameters() if p.requires_grad}

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fluxvla_core.training.lora import attach, merge_
-from tests.training.adapters import idle_parameters, shipped
+from tests.training.adapters import OWN, adapted, idle_parameters, shipped
 
 from .tiny import model_batch, tiny_model
 
@@ -16,6 +16,10 @@ CONFIG = "smolvla_libero_lora.py"
 
 def test_every_adapter_trains():
     assert idle_parameters(tiny_model(), shipped(CONFIG), model_batch()) == []
+
+
+def test_the_models_own_layers_are_those_of_the_config():
+    assert adapted(tiny_model(), OWN) == adapted(tiny_model(), shipped(CONFIG))
 
 
 def test_the_adapter_of_the_last_layer_has_an_effect_and_merges():

@@ -112,12 +112,15 @@ def _train(plan: Plan, runner: Any, context: Any) -> tuple[Any, int]:
     from fluxvla_core.contracts.runner import TrainRunner
     from fluxvla_core.errors import located
     from fluxvla_core.training.base_runner import BaseTrainRunner
-    from fluxvla_core.training.input_sizes import check_data
+    from fluxvla_core.training.fit_checks import check_data
+    from fluxvla_core.training.validation import validation_dataset
 
     with located(context.where("train_dataloader.dataset")):
         dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
     if isinstance(runner, BaseTrainRunner):  # another's collator may not be an attribute
-        check_data(context, dataset, runner.collator)
+        if runner.val_options is not None:
+            runner.val_dataset = validation_dataset(context, dataset, runner.options.seed)
+        check_data(context, dataset, runner.collator, runner.val_dataset)
     try:
         runner.run_setup(n_train_examples=len(dataset))
         ranks.mark_started(plan.work_dir)
@@ -151,7 +154,10 @@ def _write_records(plan: Plan, folder: Path) -> None:
 
 def folders_to_make(plan: Plan) -> list[Path]:
     """Folders that a run of ``plan`` makes, inner ones first."""
-    folders = [plan.work_dir / plan.section, plan.work_dir, *plan.work_dir.parents]
+    from fluxvla_core.checkpoints.manifest import FOLDER
+
+    inner = [plan.work_dir / name for name in (plan.section, FOLDER)]
+    folders = [*inner, plan.work_dir, *plan.work_dir.parents]
     return [path for path in folders if not path.exists()]
 
 

@@ -140,6 +140,12 @@ class VLA(Contract):
         ``runner.init_from`` nor ``pretrained_name_or_path`` names weights of the whole model."""
         return ()
 
+    @attribute
+    def lora_defaults(self) -> Mapping[str, Any]:
+        """Values of a train runner's table ``lora`` that names no ``target_modules``: these, and
+        ``modules_to_save``, as that table has them. Nothing: the config has to name them."""
+        return {}
+
     def checkpoint_table(self, table: Mapping[str, Any]) -> Mapping[str, Any]:
         """The config's ``model`` as a checkpoint stores it, by default ``table`` itself.
 

@@ -76,9 +76,10 @@ def example(
     known = _with_tokenizers(table, assumed)
     try:
         dataset = Dataset.adapt(build_dataset_from_cfg(known, context))
-        sample = dataset.get_sample(0, 0)
+        uncached = getattr(dataset, "uncached", None)  # one frame is wanted, not all in memory
+        sample = Dataset.adapt(dataset if uncached is None else uncached()).get_sample(0, 0)
     except FluxError as error:
-        if not assumed and _is_here(table):
+        if not assumed and is_here(table):
             raise Refused(error) from error
         return assumed_example(first_dataset(known), robot, widths, [error.what, *assumed])
     joints = dataset.embodiment
@@ -151,7 +152,8 @@ class StandInTokenizer(Tokenizer):
         return [number % 997 for number in range(max(1, np.size(actions) // 4))]
 
 
-def _is_here(table: Mapping[str, Any]) -> bool:
+def is_here(table: Mapping[str, Any]) -> bool:
+    """Whether the folders of the dataset that ``table`` describes are on this machine."""
     place = first_dataset(table).get("data_root_path")
     places = [place] if isinstance(place, str) else place
     return isinstance(places, Sequence) and bool(places) and all(map(os.path.isdir, places))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.contracts.training import Tokenizer
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, quoted
 from fluxvla_core.untrusted import read_json
 
 PACKAGE = "package:"
@@ -64,7 +64,7 @@ class PretrainedTokenizer(Tokenizer):
         ids = self._tokenizer.encode(text, add_special_tokens=add_special_tokens).ids
         if len(ids) > self.model_max_length:
             raise ConfigError(
-                f"{text!r} has {len(ids)} tokens, model_max_length is {self.model_max_length}"
+                f"{quoted(text)} has {len(ids)} tokens, model_max_length is {self.model_max_length}"
             )
         return list(ids)
 

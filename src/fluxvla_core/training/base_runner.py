@@ -162,7 +162,7 @@ class BaseTrainRunner(Strategy):
         from fluxvla_core.contracts.training import VLA
         from fluxvla_core.training import lora
         from fluxvla_core.training.cost import Meter
-        from fluxvla_core.training.input_sizes import check_start
+        from fluxvla_core.training.fit_checks import check_start
         from fluxvla_core.training.model import checkpoint_activations, compile_units
         from fluxvla_core.training.part_weights import load_part_weights
         from fluxvla_core.training.state import seed_all
@@ -190,7 +190,9 @@ class BaseTrainRunner(Strategy):
             start_training_with(vla, init_from, before, self.lora is not None, self.world)
         if self.lora is not None:
             self.adapter_base = adapter_base_to_record(before, init_from)
-            lora.attach(vla, self.lora, self.context.where(f"{self.context.section}.lora"))
+            where = self.context.where(f"{self.context.section}.lora")
+            self.lora = self.lora.for_model(vla, where)
+            lora.attach(vla, self.lora, where)
         self.flops = Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:
             checkpoint_activations(vla)

@@ -21,7 +21,7 @@ from fluxvla_core.build import (
     robot_of,
 )
 from fluxvla_core.contracts.training import VLA
-from fluxvla_core.data.example import Example, Refused, example
+from fluxvla_core.data.example import Example, Refused, example, is_here
 from fluxvla_core.errors import CheckpointError, ConfigError, FluxError
 from fluxvla_core.spec import EmbodimentSpec
 from fluxvla_core.training import lora
@@ -35,16 +35,8 @@ from fluxvla_core.training.cost import (
     footprint,
     optimizer_bytes,
 )
-from fluxvla_core.training.input_sizes import (
-    Declared,
-    check_observations,
-    check_start,
-    chunk_of,
-    declared_sizes,
-    misfits,
-    observations_in,
-    refusal,
-)
+from fluxvla_core.training.fit_checks import Samples, check_observations, check_start, unfit
+from fluxvla_core.training.input_sizes import Declared, chunk_of, declared_sizes
 from fluxvla_core.training.lora import LoraOptions
 from fluxvla_core.training.model import ForwardArguments, Layout, observations_of, trainable
 from fluxvla_core.training.strategy import Strategy
@@ -107,7 +99,11 @@ def dry_run(context: RunContext, processes: Sequence[int] = PROCESSES) -> DryRun
     # Before the data only where nothing else says how long a chunk is.
     model = None if sizes else _model(context, result, runner)
     batch = _batch(context, result, runner)
-    result.refused = result.refused or _unfit(context, result, runner, sizes, batch)
+    shown = _validation(context, result, runner)
+    if batch is not None:
+        dataset = None if result.data is None else result.data.dataset
+        shown.insert(0, Samples("train_dataloader", dataset, [batch]))
+    result.refused = result.refused or _unfit(context, result, runner, sizes, shown)
     if sizes and not result.unfit:
         model = _model(context, result, runner)
     result.skeleton, result.inputs = model, batch
@@ -143,23 +139,17 @@ def _unfit(
     found: DryRun,
     runner: BaseTrainRunner | None,
     sizes: Mapping[str, Declared],
-    batch: Mapping[str, Any] | None,
+    shown: Sequence[Samples],
 ) -> FluxError | None:
     """Why data, or the weights to start from, do not fit the model, which is not built then."""
-    table = context.config["model"]
     try:
         if runner is not None:
             check_start(context, runner.options.init_from, only_here=True)
-        if not sizes:
-            return None
-        if found.data is not None and found.data.dataset is not None:
-            check_observations(observations_in(table, sizes), found.data.dataset, context)
-        wrong = [] if batch is None else misfits(table, batch, sizes)
-    except (ConfigError, CheckpointError) as error:
-        found.unfit = True
-        return error
-    found.unfit = bool(wrong)
-    return refusal(wrong, context) if wrong else None
+        error: FluxError | None = unfit(context, sizes, shown) if sizes else None
+    except (ConfigError, CheckpointError) as refused:
+        error = refused
+    found.unfit = error is not None
+    return error
 
 
 def _model(context: RunContext, found: DryRun, runner: BaseTrainRunner | None) -> nn.Module | None:
@@ -322,6 +312,28 @@ def _batch(
         if isinstance(value, Tensor)
     }
     return batch
+
+
+def _validation(
+    context: RunContext, result: DryRun, runner: BaseTrainRunner | None
+) -> list[Samples]:
+    """The first validation sample; nothing where the dataset is elsewhere: none is assumed."""
+    if runner is None or runner.val_options is None:
+        return []
+    table = context.config["val_dataloader"]["dataset"]
+    if not isinstance(table, Mapping) or not is_here(table):
+        return []
+    try:
+        data = example(table, context, result.robot, (1, 1))
+        batch: Mapping[str, Any] = runner.collator([data.sample])
+    except Refused as refused:
+        refused.error.where = refused.error.where or context.where("val_dataloader.dataset")
+        result.refused = result.refused or refused.error
+        return []
+    except Exception as error:  # noqa: BLE001 - datasets and transforms of others
+        result.notes.append(f"the validation data are not known: {_one_line(error)}")
+        return []
+    return [] if data.dataset is None else [Samples("val_dataloader", data.dataset, [batch])]
 
 
 def _widths(model: Any, chunk: tuple[int, int] | None) -> tuple[int, int]:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -60,19 +61,24 @@ class LoraOptions:
         alpha: their sum is scaled by ``alpha / rank``; ``rank`` if not given.
         dropout: on their input.
         target_modules: linear and convolution layers that get one: ends of names, or one regular
-            expression for whole names.
-        modules_to_save: modules, by the ends of their names, that are trained as a whole.
+            expression for whole names. By default those that the model names
+            (``VLA.lora_defaults``), if it does.
+        modules_to_save: modules, by the ends of their names, that are trained as a whole; the
+            model's where ``target_modules`` are.
     """
 
     rank: int
-    target_modules: tuple[str, ...] | str
+    target_modules: tuple[str, ...] | str | None = None
     alpha: float | None = None
     dropout: float = 0.0
     modules_to_save: tuple[str, ...] = ()
 
     @classmethod
-    def read(cls, table: Any, where: str | None) -> LoraOptions:
+    def read(cls, table: Any, where: str | None, declared: bool = False) -> LoraOptions:
         """Take and check the table, or options that were made in Python.
+
+        Args:
+            declared: the model names layers itself, so that the table need not.
 
         Raises:
             ConfigError: unknown or missing keys, or invalid values.
@@ -86,7 +92,8 @@ class LoraOptions:
                 near = nearest(str(key), known)
                 hint = f"did you mean {near!r}?" if near else f"it has {', '.join(known)}"
                 raise ConfigError(f"lora has no {key!r}; {hint}", where=where)
-        lacking = [key for key in ("rank", "target_modules") if key not in table]
+        needed = ("rank",) if declared else ("rank", "target_modules")
+        lacking = [key for key in needed if table.get(key) is None]
         if lacking:
             raise ConfigError(f"lora needs {' and '.join(map(repr, lacking))}", where=where)
         values: dict[str, Any] = {
@@ -103,8 +110,9 @@ class LoraOptions:
             ),
             (
                 "target_modules",
-                bool(options.target_modules)
-                and (isinstance(options.target_modules, str) or _names(options.target_modules)),
+                options.target_modules is None
+                or isinstance(options.target_modules, str)
+                or _names(options.target_modules, least=1),
                 "names, or one regular expression",
             ),
             ("modules_to_save", _names(options.modules_to_save), "names of modules"),
@@ -114,6 +122,22 @@ class LoraOptions:
                 raise ConfigError(f"lora.{key} must be {rule}, got {value!r}", where=where)
         return options
 
+    def for_model(self, model: nn.Module, where: str | None = None) -> LoraOptions:
+        """With the layers that ``model`` names, where these options name none.
+
+        A module in ``modules_to_save`` that has another one of this name inside becomes that one.
+
+        Raises:
+            ConfigError: the model names none either; or that other one is not all of the module.
+        """
+        options = self
+        if self.target_modules is None:
+            own = VLA.adapt(model).lora_defaults
+            given = {k: v for k, v in vars(self).items() if v not in (None, ())}
+            options = self.read({**own, **given}, where)
+        saved = tuple(n for end in options.modules_to_save for n in _innermost(model, end, where))
+        return replace(options, modules_to_save=saved)
+
     def for_peft(self, base: str | None = None) -> dict[str, Any]:
         """``adapter_config.json`` as peft reads it; ``base`` is where the base weights are from."""
         targets = self.target_modules
@@ -122,7 +146,7 @@ class LoraOptions:
             "r": self.rank,
             "lora_alpha": self.alpha if self.alpha is not None else self.rank,
             "lora_dropout": self.dropout,
-            "target_modules": targets if isinstance(targets, str) else list(targets),
+            "target_modules": targets if isinstance(targets, str) else list(targets or ()),
             "modules_to_save": list(self.modules_to_save) or None,
             "base_model_name_or_path": base,
             "inference_mode": True,
@@ -174,6 +198,8 @@ def attach(
     """
     from peft import LoraConfig, inject_adapter_in_model
 
+    if not trained:
+        options = options.for_model(model, where)
     _check_found(model, options, where)
     if not trained:
         _check_unambiguous(model, options.modules_to_save, where)
@@ -195,7 +221,7 @@ def attach(
 def _check_found(model: nn.Module, options: LoraOptions, where: str | None) -> None:
     targets = options.target_modules
     for key, ends in (
-        ("target_modules", () if isinstance(targets, str) else targets),
+        ("target_modules", () if isinstance(targets, str) else targets or ()),
         ("modules_to_save", options.modules_to_save),
     ):
         for end in ends:
@@ -205,6 +231,25 @@ def _check_found(model: nn.Module, options: LoraOptions, where: str | None) -> N
                     where=where,
                     next=f"the model has {_leaf_names(model)}",
                 )
+
+
+def _innermost(model: nn.Module, end: str, where: str | None) -> list[str]:
+    """``end``, or the whole names of the inner modules where modules of that name are nested.
+
+    peft wraps both, and then trains only a copy that the forward pass does not use.
+    """
+    hit = {name: module for name, module in model.named_modules() if _ends(name, end)}
+    nested = {n: inner for n in hit if (inner := [i for i in hit if _inside(i, n)])}
+    for name, inner in nested.items():
+        parts = [id(p) for i in inner for p in hit[i].parameters()]
+        if {id(p) for p in hit[name].parameters()} - set(parts):
+            raise ConfigError(
+                f"lora.modules_to_save: {end!r} hits {name!r} and, inside it, {_listed(inner)}",
+                where=where,
+                cause="peft would train a copy of the inner one that is not used",
+                next=f"name the parts of {name!r} that are to be trained",
+            )
+    return [name for name in hit if name not in nested] if nested else [end]
 
 
 def _check_unambiguous(model: nn.Module, saved: Sequence[str], where: str | None) -> None:
@@ -332,5 +377,6 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:8]) + (" …" if len(names) > 8 else "")
 
 
-def _names(value: Sequence[Any]) -> bool:
-    return isinstance(value, tuple) and all(isinstance(item, str) for item in value)
+def _names(value: Any, least: int = 0) -> bool:
+    named = isinstance(value, tuple) and all(isinstance(item, str) for item in value)
+    return named and len(value) >= least

@@ -6,10 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fluxvla_core.build import RunContext
+from fluxvla_core.build import RunContext, class_of
 from fluxvla_core.config.resolve import LOADER_KEYS
 from fluxvla_core.config.similar_keys import similar_key
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import VLA
 from fluxvla_core.errors import ConfigError, Problem
+from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.training.lora import LoraOptions, check_installed, is_count, is_positive
 from fluxvla_core.training.optimizers import make_schedule
 
@@ -73,8 +76,8 @@ class TrainOptions:
     """weights to start from: a checkpoint's folder, a work dir, a safetensors file; a run that goes
     on has its own, or its adapter's base, instead."""
     lora: LoraOptions | Mapping[str, Any] | None = None
-    """train low-rank adapters only: table of ``rank``, ``target_modules`` and, if wanted,
-    ``alpha``, ``dropout``, ``modules_to_save``."""
+    """train low-rank adapters only: table of ``rank`` and, if wanted, ``target_modules``,
+    ``modules_to_save`` (both are the model's own by default), ``alpha``, ``dropout``."""
     ema_decay: float | None = None
     """decay of averaged weights (EMA), which are kept too and used for inference; None: none."""
     val_iter_interval: int | None = None
@@ -178,7 +181,9 @@ class TrainOptions:
             return None
         where = context.where(f"{context.section}.lora")
         check_installed(where)
-        return LoraOptions.read(self.lora, where)
+        table = context.config.get("model")
+        kind = class_of(table.get("type"), VLAS) if isinstance(table, Mapping) else type(table)
+        return LoraOptions.read(self.lora, where, implements(kind, VLA, "lora_defaults"))
 
     @property
     def save_steps(self) -> int | None:

@@ -67,6 +67,8 @@ class Strategy(TrainRunner):
     """Frozen weights that checkpoints do not contain; found when the training begins."""
     resume_checkpoint: Checkpoint | None = None
     """The checkpoint that the run resumes from; None for a fresh start."""
+    val_dataset: Any = None
+    """The dataset of ``val_dataloader``, if it was built before ``run``, which builds it else."""
     # Known inside run().
     dataset: Any = None
     plan: StepPlan

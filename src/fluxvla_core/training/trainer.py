@@ -20,7 +20,7 @@ from fluxvla_core.data.sampler import StepSampler, episode_shards
 from fluxvla_core.errors import located
 from fluxvla_core.hooks import HookCaller
 from fluxvla_core.training.cost import GB, peak_bytes
-from fluxvla_core.training.input_sizes import check_observations
+from fluxvla_core.training.fit_checks import check_observations
 from fluxvla_core.training.model import ForwardArguments, observations_of, trainable
 from fluxvla_core.training.resuming import forget_missing, restore_rng
 from fluxvla_core.training.saving import Saver
@@ -96,7 +96,9 @@ class Trainer:
         if runner.val_options is None:
             return None
         seed = runner.options.seed
-        held_out = validation_dataset(runner.context, dataset, seed)
+        held_out = runner.val_dataset
+        if held_out is None:
+            held_out = validation_dataset(runner.context, dataset, seed)
         takes = observations_of(runner.model)
         check_observations(takes, held_out, runner.context, "val_dataloader")
         return Validation(

@@ -14,7 +14,7 @@ from fluxvla_core.contracts.contract import implements
 from fluxvla_core.contracts.training import Dataset
 from fluxvla_core.data.loader import loader_source, make_loader, to_device
 from fluxvla_core.data.sampler import StepPlan, StepSampler
-from fluxvla_core.errors import ConfigError, RunFailed
+from fluxvla_core.errors import ConfigError, RunFailed, located
 from fluxvla_core.training.distributed import World, all_reduce_sum
 from fluxvla_core.training.options import LoaderOptions
 from fluxvla_core.training.state import Ema, rank_seed, rng_state, seed_all, set_rng_state
@@ -130,8 +130,9 @@ def reshard(model: nn.Module) -> None:
 
 def validation_dataset(context: RunContext, train: Any, seed: int) -> Any:
     """The dataset of ``val_dataloader``, normalised by the statistics of the dataset ``train``."""
-    dataset = build_dataset_from_cfg(context.config["val_dataloader"]["dataset"], context)
-    share_statistics(train, dataset)
+    with located(context.where("val_dataloader.dataset")):
+        dataset = build_dataset_from_cfg(context.config["val_dataloader"]["dataset"], context)
+        share_statistics(train, dataset)
     Dataset.adapt(dataset).use_seed(seed)
     return dataset
 

@@ -151,6 +151,7 @@ class GR00TActionHead(nn.Module):
         state: Tensor,
         ids: Tensor,
         cache: list[KVCache] | None = None,
+        given: Tensor | None = None,
     ) -> Tensor:
         """The velocity ``(B, T, D)`` at ``x`` ``(B, T, D)``.
 
@@ -158,15 +159,20 @@ class GR00TActionHead(nn.Module):
             steps: ``(B,)`` int64, the time in thousandths.
             context: of ``encode_context``; state: of ``encode_states``; ids: ``(B,)`` int64.
             cache: the blocks' KV caches of the context, shared by all steps.
+            given: ``(B, T)`` bool, the actions of ``x`` that are known: theirs is the time of data.
         """
-        actions = self.action_encoder(x, steps, ids)
+        each = steps if given is None else torch.where(given, _BUCKETS, steps[:, None])
+        actions = self.action_encoder(x, each, ids)
         actions = actions + self.positions.weight[: x.shape[1]].to(actions.dtype)
         tokens = [state, actions]
         if self.future_tokens is not None:
             future = self.future_tokens.weight.to(actions.dtype)
             tokens.insert(1, future.expand(len(x), -1, -1))
         joined = torch.cat(tokens, dim=1)
-        hidden = self.dit(joined, steps, context.features, self._masks(context), cache)
+        if given is not None:
+            before = steps[:, None].expand(-1, joined.shape[1] - x.shape[1])
+            each = torch.cat([before, each], dim=1)
+        hidden = self.dit(joined, each, context.features, self._masks(context), cache)
         return self.action_decoder(hidden[:, -x.shape[1] :], ids)
 
     def errors(
@@ -177,12 +183,15 @@ class GR00TActionHead(nn.Module):
         actions: Tensor,
         noise: Tensor,
         time: Tensor,
+        prefix_len: Tensor | None = None,
     ) -> Tensor:
         """Squared errors of the velocity, ``(B * K, T, ori_action_dim)``, K noise samples each.
 
         Args:
             states: ``(B, S)``; ids: ``(B,)`` int64; actions: ``(B, T, D)`` normalised.
             noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1.
+            prefix_len: ``(B, K)`` int64: so many actions at the beginning are given, without noise,
+                and their errors are 0.
         """
         check_actions("GR00TActionHead", tuple(actions.shape[1:]), (self.horizon, self.action_dim))
         repeats = noise.shape[1]
@@ -192,9 +201,14 @@ class GR00TActionHead(nn.Module):
         t = time[..., None, None]
         mixed = ((1 - t) * noise + t * clean).flatten(0, 1)
         target = (clean - noise).flatten(0, 1)
-        steps = (time.flatten() * _BUCKETS).long()
-        velocity = self.velocity(mixed, steps, encoded, state, ids.repeat_interleave(repeats, 0))
-        return (velocity - target)[..., : self.loss_dim].float().square()
+        given = None
+        if prefix_len is not None:
+            given = self._first(prefix_len.flatten())
+            mixed = torch.where(given[..., None], clean.flatten(0, 1), mixed)
+        steps, ids = (time.flatten() * _BUCKETS).long(), ids.repeat_interleave(repeats, 0)
+        velocity = self.velocity(mixed, steps, encoded, state, ids, given=given)
+        errors = (velocity - target)[..., : self.loss_dim].float().square()
+        return errors if given is None else errors * ~given[..., None]
 
     def loss(self, errors: Tensor, masks: Tensor) -> Tensor:
         """The mean of ``errors`` ``(B * K, T, D)``, where ``masks`` ``(B, T)`` is 0 counted as 0.
@@ -213,10 +227,12 @@ class GR00TActionHead(nn.Module):
         ids: Tensor,
         noise: Tensor,
         guide: Guide | None = None,
+        by_prefix: bool = False,
     ) -> Tensor:
         """Integrate from ``noise`` ``(B, T, D)`` to a chunk ``(B, T, D)`` by Euler steps.
 
-        ``guide`` makes it continue another chunk; that takes a backward pass for each step.
+        ``guide`` makes it continue another chunk; that takes a backward pass for each step, or,
+        ``by_prefix``, none: what is frozen is given, as in training with ``prefix_len``.
         """
         if guide is None:
             return self.denoise(self.observe(context, states, ids), noise, self.step_tables())
@@ -230,6 +246,10 @@ class GR00TActionHead(nn.Module):
             velocity = partial(
                 self.velocity, steps=steps, context=encoded, state=state, ids=ids, cache=cache
             )
+            if by_prefix:
+                x = guide.freeze(x)
+                x = x + velocity(x, given=self._first(guide.frozen)) / self.num_steps
+                continue
             clean, pull = guide.pull(partial(_estimate, velocity, t), x, t)
             x = x + (clean - x) / (self.num_steps - step) + pull / self.num_steps
         return guide.freeze(x)
@@ -288,6 +308,10 @@ class GR00TActionHead(nn.Module):
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
         return [*self.context_blocks, *self.dit.blocks]
+
+    def _first(self, length: Tensor) -> Tensor:
+        """``(B, T)``, True for the first ``length`` ``(B,)`` actions of a chunk."""
+        return torch.arange(self.horizon, device=length.device) < length[:, None]
 
     def _masks(self, context: Context) -> list[Tensor | None]:
         """The attention mask of each block that attends to the context."""

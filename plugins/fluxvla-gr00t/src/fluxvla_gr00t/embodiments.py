@@ -64,9 +64,13 @@ class ActionEncoder(nn.Module):
         self.out = EmbodimentLinear(embodiments, width, width)
 
     def forward(self, actions: Tensor, steps: Tensor, ids: Tensor) -> Tensor:
-        """``actions`` ``(B, T, D)``, ``steps`` and ``ids`` ``(B,)`` int64 -> ``(B, T, W)``."""
+        """``actions`` ``(B, T, D)``, ``ids`` ``(B,)`` int64 -> ``(B, T, W)``.
+
+        ``steps`` are ``(B,)`` int64, or ``(B, T)``: one for each action.
+        """
         chosen = {name: part.chosen(ids) for name, part in self.named_children()}
-        return self.of(actions, self.waves(steps)[:, None], chosen)
+        waves = self.waves(steps if steps.ndim == 2 else steps[:, None])
+        return self.of(actions, waves, chosen)
 
     def of(self, actions: Tensor, waves: Tensor, chosen: Mapping[str, Chosen]) -> Tensor:
         """As ``forward``, with weights and ``waves``, broadcast to tokens, from before."""
@@ -75,8 +79,8 @@ class ActionEncoder(nn.Module):
         return applied(functional.silu(applied(joined, chosen["joined"])), chosen["out"])
 
     def waves(self, steps: Tensor) -> Tensor:
-        """Sinusoidal features ``(B, W)`` float32 of the time steps ``(B,)``."""
+        """Sinusoidal features ``(..., W)`` float32 of the time steps ``(...)``."""
         half = self.width // 2
         powers = torch.arange(half, device=steps.device, dtype=torch.float32)
-        angles = steps[:, None].float() * torch.exp(-powers * (math.log(10000.0) / half))
+        angles = steps[..., None].float() * torch.exp(-powers * (math.log(10000.0) / half))
         return torch.cat([angles.sin(), angles.cos()], dim=-1)

@@ -33,6 +33,9 @@ class GR00T(VLA, nn.Module):
         embodiment_id: the embodiment of batches that do not say theirs.
         pretrained_name_or_path: weights that a training starts from, for instance a published
             checkpoint's folder.
+        prefix_conditioning: chunks that continue another are trained for and made by holding their
+            beginning (Black et al. 2025, arXiv 2512.05964); without, they are made by guidance.
+            Training takes ``prefix_len`` of ``SamplePrefixLength`` then.
     """
 
     input_sizes = InputSizes(
@@ -51,6 +54,7 @@ class GR00T(VLA, nn.Module):
         freeze_vlm_backbone: bool = True,
         embodiment_id: int = 0,
         pretrained_name_or_path: str | None = None,
+        prefix_conditioning: bool = False,
     ) -> None:
         super().__init__()
         self.pretrained_name_or_path = pretrained_name_or_path
@@ -64,6 +68,7 @@ class GR00T(VLA, nn.Module):
                 f"0..{self.vla_head.embodiments - 1}, the embodiments that the head has layers for"
             )
         self.embodiment_id = embodiment_id
+        self.prefix_conditioning = prefix_conditioning
 
     def forward(
         self,
@@ -77,6 +82,7 @@ class GR00T(VLA, nn.Module):
         time: Tensor,
         img_masks: Tensor | None = None,
         embodiment_ids: Tensor | None = None,
+        prefix_len: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """One training batch -> ``{"loss": scalar, "sample_losses": (B,)}``.
 
@@ -87,10 +93,23 @@ class GR00T(VLA, nn.Module):
             action_masks: ``(B, T)``, 0 beyond the end of an episode.
             noise: ``(B, K, T, D)``; time: ``(B, K)`` in 0..1: K noise samples each.
             embodiment_ids: ``(B,)`` int64; ``embodiment_id`` without.
+            prefix_len: ``(B, K)`` int64: so many actions at the beginning are given, without noise,
+                and their errors count as 0, for ``prefix_conditioning``.
+
+        Raises:
+            ConfigError: inputs of another shape; ``prefix_len`` without ``prefix_conditioning``, or
+                the reverse.
         """
+        if self.prefix_conditioning != (prefix_len is not None):
+            raise ConfigError(
+                f"prefix_conditioning is {self.prefix_conditioning}, and the batch has "
+                f"{'no' if prefix_len is None else 'a'} prefix_len",
+                next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
+                "prefix_len among the collator's keys, belong to prefix_conditioning=True",
+            )
         context = self._context(images, lang_tokens, lang_masks, img_masks)
         ids = self._ids(states, embodiment_ids)
-        errors = self.vla_head.errors(context, states, ids, actions, noise, time)
+        errors = self.vla_head.errors(context, states, ids, actions, noise, time, prefix_len)
         masked = errors.detach().unflatten(0, (len(states), -1)) * action_masks[:, None, :, None]
         loss = self.vla_head.loss(errors, action_masks)
         return {"loss": loss, "sample_losses": masked.flatten(1).mean(1)}
@@ -113,7 +132,8 @@ class GR00T(VLA, nn.Module):
 
         Args:
             prev_actions: ``(B, T, D)`` normalised, to go on from; the other three belong to it,
-                see ``fluxvla_models.guidance.Guide``.
+                see ``fluxvla_models.guidance.Guide``. With ``prefix_conditioning`` ``prefix_len``
+                rows are held, the rest is free.
             prefix_weights: ``(B, T)``; prefix_len, max_guidance_weight: ``(B,)``.
         """
         guide = Guide.of(prev_actions, prefix_weights, prefix_len, max_guidance_weight)
@@ -122,7 +142,7 @@ class GR00T(VLA, nn.Module):
             return self.denoise(seen, noise, self.step_tables())
         context = self._context(images, lang_tokens, lang_masks, img_masks)
         ids = self._ids(states, embodiment_ids)
-        return self.vla_head.sample(context, states, ids, noise, guide)
+        return self.vla_head.sample(context, states, ids, noise, guide, self.prefix_conditioning)
 
     def observe(
         self,
@@ -154,6 +174,12 @@ class GR00T(VLA, nn.Module):
     def action_shape(self) -> tuple[int, int]:
         """``(T, D)`` of a chunk, and of the noise that one starts from."""
         return self.vla_head.horizon, self.vla_head.action_dim
+
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """The attention of the action head, as NVIDIA's fine-tuning has it."""
+        layers = r"vla_head\.(dit\.blocks|context_blocks)\.\d+\.attention\.(query|key|value)"
+        return {"target_modules": layers}
 
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""

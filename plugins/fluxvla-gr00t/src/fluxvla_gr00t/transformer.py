@@ -110,14 +110,15 @@ class DiTBlock(nn.Module):
         cache: KVCache | None = None,
         modulation: Tensor | None = None,
     ) -> Tensor:
-        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``; for the others see ``Attention``.
+        """``x`` ``(B, T, W)`` at ``time`` ``(B, W)``, or ``(B, T, W)`` where tokens have times of
+        their own; for the others see ``Attention``.
 
         ``modulation`` ``(2 * W,)``: scale and shift, instead of ``time``, where all samples share
         it.
         """
         if modulation is None:
             assert time is not None
-            modulation = self.modulation(time)[:, None]
+            modulation = _for_tokens(self.modulation(time))
         scale, shift = modulation.chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-5) * (1 + scale) + shift
         attended = self.attention(normal, normal if context is None else context, mask, cache)
@@ -125,7 +126,7 @@ class DiTBlock(nn.Module):
         return x + self.feed_forward(functional.layer_norm(x, x.shape[-1:], eps=1e-5))
 
     def modulation(self, time: Tensor) -> Tensor:
-        """``(B, W)`` -> scale and shift ``(B, 2 * W)``."""
+        """``(..., W)`` -> scale and shift ``(..., 2 * W)``."""
         return self.modulate(functional.silu(time))
 
 
@@ -149,7 +150,7 @@ class ContextBlock(nn.Module):
 
 
 class TimeEncoder(nn.Module):
-    """Time step ``(B,)`` int64 -> ``(B, W)``: 128 cosines, 128 sines and two layers."""
+    """Time steps ``(...)`` int64 -> ``(..., W)``: 128 cosines, 128 sines and two layers."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -159,7 +160,7 @@ class TimeEncoder(nn.Module):
     def forward(self, steps: Tensor) -> Tensor:
         half = _SINES // 2
         powers = torch.arange(half, device=steps.device, dtype=torch.float32) / (half - 1)
-        angles = steps[:, None].float() * torch.exp(-math.log(_LONGEST) * powers)
+        angles = steps[..., None].float() * torch.exp(-math.log(_LONGEST) * powers)
         waves = torch.cat([angles.cos(), angles.sin()], dim=-1).to(self.hidden.weight.dtype)
         return self.out(functional.silu(self.hidden(waves)))
 
@@ -195,7 +196,7 @@ class DiT(nn.Module):
         masks: list[Tensor | None],
         cache: list[KVCache] | None = None,
     ) -> Tensor:
-        """``x`` ``(B, T, W)`` at ``steps`` ``(B,)`` int64.
+        """``x`` ``(B, T, W)`` at ``steps`` ``(B,)`` int64, or ``(B, T)``: one for each token.
 
         Args:
             context: ``(B, L, C)``.
@@ -209,7 +210,7 @@ class DiT(nn.Module):
             else:
                 pair = layer // 2
                 x = block(x, time, context, masks[pair], None if cache is None else cache[pair])
-        return self._out(x, self.modulate(functional.silu(time))[:, None])
+        return self._out(x, _for_tokens(self.modulate(functional.silu(time))))
 
     def step_tables(self, steps: Tensor) -> dict[str, Tensor]:
         """Tensors that depend only on the times ``steps`` ``(K,)`` of the integration steps.
@@ -249,3 +250,8 @@ class DiT(nn.Module):
         shift, scale = modulation.chunk(2, dim=-1)
         normal = functional.layer_norm(x, x.shape[-1:], eps=1e-6)
         return self.out(normal * (1 + scale) + shift)
+
+
+def _for_tokens(modulation: Tensor) -> Tensor:
+    """``(B, 2 * W)`` for all tokens of a sample, or ``(B, T, 2 * W)`` as it is."""
+    return modulation[:, None] if modulation.ndim == 2 else modulation

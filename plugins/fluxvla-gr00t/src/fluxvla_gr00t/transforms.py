@@ -139,15 +139,15 @@ class ProcessQwenPrompts(Transform):
         ids = list(self.tokenizer.encode(f"<|im_start|>user\n{images}{instruction}<|im_end|>\n"))
         if ids.count(self._image_token) != count * tokens_per_image:
             raise ConfigError(
-                f"ProcessQwenPrompts: the chat around the instruction {instruction!r} has "
+                f"ProcessQwenPrompts: the chat around the instruction {instruction[:100]!r} has "
                 f"{ids.count(self._image_token)} image tokens, {count} x {tokens_per_image} "
                 "expected",
                 cause=f"the instruction itself holds {_IMAGE_TOKEN}",
             )
         if len(ids) > self.max_len:
             raise ConfigError(
-                f"ProcessQwenPrompts: the instruction {instruction!r} has {len(ids)} tokens with "
-                f"{count} x {tokens_per_image} image tokens, max_len is {self.max_len}",
+                f"ProcessQwenPrompts: the instruction {instruction[:100]!r} has {len(ids)} tokens "
+                f"with {count} x {tokens_per_image} image tokens, max_len is {self.max_len}",
                 next=f"--set <ProcessQwenPrompts>.max_len={len(ids)} (or more)",
             )
         tokens = np.full(self.max_len, int(self.tokenizer.pad_token_id or 0), np.int64)

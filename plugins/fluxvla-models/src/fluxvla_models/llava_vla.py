@@ -187,6 +187,16 @@ class LlavaVLA(VLA, nn.Module):
         }
         return {**table, **sized}
 
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """Every linear layer of the language model; projector and head are trained as a whole."""
+        layers = (
+            r"(llm_backbone\.model|vlm_backbone\.model\.language_model)\.layers\.\d+"
+            r"\.(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+        )
+        whole = [name for name in ("projector", "vla_head") if name in self._parts]
+        return {"target_modules": layers, "modules_to_save": whole}
+
     def fsdp_units(self) -> list[nn.Module]:
         """Blocks to shard one by one."""
         units: list[nn.Module] = []

@@ -65,7 +65,18 @@ class SentenceEncoder(nn.Module):
         return super().train(False)
 
     def forward(self, tokens: Tensor, masks: Tensor) -> Tensor:
-        """``(B, L)`` int64 tokens and bool masks -> ``(B, out_dim)`` float32."""
+        """``(B, L)`` int64 tokens and bool masks -> ``(B, out_dim)`` float32.
+
+        Raises:
+            ConfigError: there are more tokens than the encoder has positions for.
+        """
+        places = getattr(self.encoder.config, "max_position_embeddings", None)
+        if places is not None and tokens.shape[1] > places:
+            raise ConfigError(
+                f"SentenceEncoder: an instruction has {tokens.shape[1]} places for tokens, the "
+                f"encoder {places}",
+                next=f"--set <ProcessPrompts>.max_len={places} (or less)",
+            )
         if not has_values(tokens):  # without values no instruction can be looked up
             return tokens.new_empty((len(tokens), self.out_dim), dtype=torch.float32)
         rows = tokens.masked_fill(~masks, 0).cpu()

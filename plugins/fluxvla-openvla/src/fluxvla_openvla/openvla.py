@@ -96,6 +96,12 @@ class OpenVLA(Prismatic):
         self.freeze(freeze_vision_backbone, freeze_llm_backbone)
         self.action_tokens = ActionTokens(self.size.text_vocab_size)
 
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """As of ``Prismatic``, and the layer that predicts tokens."""
+        layers = super().lora_defaults["target_modules"]
+        return {"target_modules": rf"{layers}|language_model\.lm_head"}
+
     def forward(
         self,
         images: Tensor,

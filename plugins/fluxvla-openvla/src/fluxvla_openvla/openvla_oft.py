@@ -114,6 +114,13 @@ class OpenVLAOFT(Prismatic):
             keys |= {"noise": True, "time": True}
         return keys
 
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """As of ``Prismatic``; the parts that OpenVLA has not are trained as a whole."""
+        parts = ("action_head", "proprio_projector", "noisy_action_projector")
+        whole = [name for name in parts if hasattr(self, name)]
+        return {**super().lora_defaults, "modules_to_save": whole}
+
     def fsdp_units(self) -> list[Any]:
         """As of ``Prismatic``, and the action head."""
         return [*super().fsdp_units(), self.action_head]

@@ -81,6 +81,22 @@ class Prismatic(VLA, nn.Module):
         """``(T, D)`` of a chunk."""
         return self.horizon, self.action_dim
 
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """Every linear layer that the loss reaches, as OpenVLA's fine-tuning has it."""
+        towers = ("featurizer", "fused_featurizer")
+        unused = (len(getattr(self.vision_backbone, name).blocks) - 1 for name in towers)
+        blocks = (
+            rf"vision_backbone\.{name}\.blocks\.(?!{last}\.)\d+\.(attn\.(qkv|proj)|mlp\.fc[12])"
+            for name, last in zip(towers, unused, strict=True)
+        )
+        others = (
+            r"vision_backbone\.(fused_)?featurizer\.patch_embed\.proj",
+            r"projector\.fc[123]",
+            r"language_model\.model\.layers\.\d+\.(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)",
+        )
+        return {"target_modules": "|".join([*blocks, *others])}
+
     def fsdp_units(self) -> list[Any]:
         """Blocks of both towers, the projector and layers of the language model, one by one."""
         vision = self.vision_backbone

@@ -76,8 +76,8 @@ class ProcessOpenVLAPrompts(Transform):
             ids = [*ids, self.empty_token]
         if len(ids) > self.max_len:
             raise ConfigError(
-                f"ProcessOpenVLAPrompts: the prompt with {text!r} has {len(ids)} tokens, max_len "
-                f"is {self.max_len}",
+                f"ProcessOpenVLAPrompts: the prompt with {text[:100]!r} has {len(ids)} tokens, "
+                f"max_len is {self.max_len}",
                 next=f"--set <ProcessOpenVLAPrompts>.max_len={len(ids)} (or more) where the model "
                 "is trained, or use shorter words",
             )

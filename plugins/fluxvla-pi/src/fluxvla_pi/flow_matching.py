@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from fluxvla_models.folded_attention import folded_mask
@@ -23,7 +24,7 @@ from torch import Tensor, nn
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA, InputSizes
 from fluxvla_pi.acting import Seen, expert_step, seen_of
-from fluxvla_pi.gemma import GemmaDecoder, Rope, rope_of
+from fluxvla_pi.gemma import LINEAR_LAYERS, GemmaDecoder, Rope, rope_of
 from fluxvla_pi.paligemma import Prefix, embed_prefix
 from fluxvla_pi.siglip import SiglipVisionTower
 from fluxvla_pi.sizes import gemma_size, image_side, siglip_size
@@ -87,6 +88,8 @@ class PiFlowMatching(VLA, nn.Module):
 
     adaptive: bool
     """Whether the time enters by adaptive normalisation."""
+    projections: ClassVar[Sequence[str]]
+    """The layers around the expert, which adapters do not suffice for."""
     input_sizes = InputSizes(
         image_size=("vision_variant", image_side),
         actions="max_action_dim",
@@ -162,6 +165,17 @@ class PiFlowMatching(VLA, nn.Module):
         """The layers of the vision tower, and pairs of the language model's and the expert's."""
         pairs = zip(self.llm_backbone.layers, self.llm_expert.layers, strict=True)
         return [*self.vision_backbone.layers, *pairs]
+
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """Every linear layer of both transformers that the loss reaches."""
+        last = len(self.llm_backbone.layers) - 1
+        # Of the language model's last layer, only keys and values are used.
+        targets = (
+            rf"(llm_expert\.layers\.\d+|llm_backbone\.layers\.(?!{last}\.)\d+)\.{LINEAR_LAYERS}"
+            rf"|llm_backbone\.layers\.{last}\.self_attn\.[kv]_proj"
+        )
+        return {"target_modules": targets, "modules_to_save": self.projections}
 
     def forward(
         self,

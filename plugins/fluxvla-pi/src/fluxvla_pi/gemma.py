@@ -17,6 +17,8 @@ from fluxvla_pi.sizes import GemmaSize
 
 EPS = 1e-6
 ROPE_BASE = 10000.0
+LINEAR_LAYERS = r"(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
+"""Names of a layer's linear layers, a regular expression."""
 Rope = tuple[Tensor, Tensor]
 """Cosines and sines, each ``(B, 1, L, head_dim)`` float32."""
 

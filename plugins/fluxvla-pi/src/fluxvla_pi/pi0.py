@@ -24,6 +24,13 @@ class PI0FlowMatching(PiFlowMatching):
     """
 
     adaptive = False
+    projections = (
+        "action_in_proj",
+        "action_out_proj",
+        "action_time_mlp_in",
+        "action_time_mlp_out",
+        "state_proj",
+    )
     input_sizes = replace(PiFlowMatching.input_sizes, states="max_state_dim")
 
     def __init__(self, max_state_dim: int = 32, **kwargs: Any) -> None:

@@ -22,6 +22,7 @@ class PI05FlowMatching(PiFlowMatching):
     """
 
     adaptive = True
+    projections = ("action_in_proj", "action_out_proj", "time_mlp_in", "time_mlp_out")
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)

@@ -22,7 +22,7 @@ from fluxvla_core import build_tokenizer_from_cfg
 from fluxvla_core.errors import ConfigError
 from fluxvla_core.models import VLA, InputSizes, built_without_memory, has_values
 from fluxvla_pi.action_tokens import ActionWords
-from fluxvla_pi.gemma import GemmaDecoder, rope_of
+from fluxvla_pi.gemma import LINEAR_LAYERS, GemmaDecoder, rope_of
 from fluxvla_pi.paligemma import Prefix, embed_prefix, rope_positions
 from fluxvla_pi.siglip import SiglipVisionTower
 from fluxvla_pi.sizes import gemma_size, image_side, siglip_size
@@ -119,6 +119,11 @@ class PI0FAST(VLA, nn.Module):
     def action_shape(self) -> tuple[int, int]:
         """``(T, D)`` of a chunk."""
         return self.n_action_steps, self.action_dim
+
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """Every linear layer of the language model."""
+        return {"target_modules": rf"llm_backbone\.layers\.\d+\.{LINEAR_LAYERS}"}
 
     def fsdp_units(self) -> list[nn.Module]:
         """The layers of the vision tower and of the language model."""

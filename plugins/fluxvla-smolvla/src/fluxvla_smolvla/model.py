@@ -320,6 +320,16 @@ class SmolVLA(VLA, nn.Module):
         """``(T, D)`` of a chunk, and of the noise that one starts from."""
         return self.n_action_steps, self.max_action_dim
 
+    @property
+    def lora_defaults(self) -> dict[str, Any]:
+        """The expert's attention and the layers around it."""
+        return {
+            "target_modules": (
+                r"expert\.layers\.\d+\.self_attn\.[qv]_proj|state_proj|action_out_proj"
+                r"|embed_actions\.(action_in_proj|action_time_mlp_(in|out))"
+            )
+        }
+
     def fsdp_units(self) -> list[nn.Module]:
         """The layers of the vision tower, of the language model and of the expert."""
         return [*self.vision.layers, *self.text.layers, *self.expert.layers]

@@ -104,6 +104,12 @@ class SmolVLADenormalize(Transform):
                 f"SmolVLANormalize: the model gives actions of shape {action.shape}, the "
                 f"statistics describe {self.scale.dim} dimensions"
             )
+        if self.scale.low.ndim > 1 and len(self.scale.low) != len(action):
+            raise ConfigError(
+                f"SmolVLANormalize: the model gives {len(action)} actions, the statistics describe "
+                f"{len(self.scale.low)} steps one by one",
+                cause="per_step_statistics of a chunk of another length",
+            )
         return self.scale.inverse(action[:, : self.scale.dim]).astype(np.float64)
 
 

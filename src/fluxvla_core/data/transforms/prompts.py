@@ -12,7 +12,7 @@ import numpy.typing as npt
 from fluxvla_core.build import build_tokenizer_from_cfg
 from fluxvla_core.contracts.frame import Sample
 from fluxvla_core.contracts.training import Tokenizer, Transform
-from fluxvla_core.errors import ConfigError
+from fluxvla_core.errors import ConfigError, quoted
 
 Encoded = tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]
 KEPT = 4096
@@ -69,7 +69,8 @@ class ProcessPrompts(Transform):
     def _pad(self, ids: Sequence[int], text: str) -> Encoded:
         if len(ids) > self.max_len:
             raise ConfigError(
-                f"{self._who}: the instruction {text!r} has {len(ids)} tokens{self._counted()}, "
+                f"{self._who}: the instruction {quoted(text)} has {len(ids)} tokens"
+                f"{self._counted()}, "
                 f"max_len is {self.max_len}",
                 next=f"--set <{self._who}>.max_len={len(ids)} (or more) where the model "
                 "is trained, or use shorter words",
@@ -152,8 +153,8 @@ class ProcessPromptsWithImage(ProcessPrompts):
         found, expected = list(ids).count(self._place), self.num_images * self.fixed_img_tokens
         if found != expected:
             raise ConfigError(
-                f"{self._who}: the chat around the instruction {text!r} has {found} places for "
-                f"images, {expected} expected",
+                f"{self._who}: the chat around the instruction {quoted(text)} has {found} "
+                f"places for images, {expected} expected",
                 cause=f"the instruction itself holds {_PLACE}",
             )
         return ids

@@ -234,6 +234,7 @@ class DenormalizePrivateAction(Transform):
                 f"{type(self).__name__}: the model gives {action.shape[-1]} dimensions, "
                 f"the statistics describe {scale.dim}"
             )
+        _check_steps(action, scale, self.action_key, type(self).__name__)
         return scale.inverse(action[:, : scale.dim], data.get("states"))
 
     def _scale(self) -> Affine:
@@ -299,12 +300,14 @@ def _entry(stats: Any, key: str, who: str) -> Mapping[str, Any]:
     return entry
 
 
-def _check_steps(actions: Any, scale: Affine, key: str) -> None:
+def _check_steps(
+    actions: Any, scale: Affine, key: str, who: str = "NormalizeStatesAndActions"
+) -> None:
     """Statistics of every step of a window fit windows of that length only."""
     steps = np.shape(actions)[-2] if np.ndim(actions) > 1 else 1
     if scale.offset.ndim > 1 and len(scale.offset) != steps:
         raise ConfigError(
-            f"NormalizeStatesAndActions: actions of {steps} steps, the statistics {key!r} "
+            f"{who}: actions of {steps} steps, the statistics {key!r} "
             f"describe {len(scale.offset)} steps one by one",
             cause="per_step_statistics of a window of another length",
             next="make action_window_size that of the statistics, or compute them again",

@@ -41,7 +41,7 @@ NAMES = (
     (r"\bvae_encoder_pos_enc$", "style_places"),
     (r"\bencoder_robot_state_input_proj\.", "state."),
     (r"\bencoder_latent_input_proj\.", "from_latent."),
-    (r"\bencoder_img_feat_input_proj\.", "picture."),
+    (r"\bencoder_img_feat_input_proj\.", "image_proj."),
     (r"\bencoder_1d_feature_pos_embed\.", "token_places."),
     (r"\bdecoder_pos_embed\.", "queries."),
     (r"\baction_head\.", "head."),

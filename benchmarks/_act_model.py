@@ -59,7 +59,7 @@ class BasicBlock(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """Pictures to a feature map of a 32nd of their size (He et al. 2015, table 1)."""
+    """Images to a feature map of a 32nd of their size (He et al. 2015, table 1)."""
 
     channels = 512
 
@@ -227,7 +227,7 @@ class BenchACT(nn.Module):
         self.decoder_norm = nn.LayerNorm(width)
         self.state = nn.Linear(state_dim, width)
         self.from_latent = nn.Linear(latent, width)
-        self.picture = nn.Conv2d(self.backbone.channels, width, 1)
+        self.image_proj = nn.Conv2d(self.backbone.channels, width, 1)
         self.token_places = nn.Embedding(2, width)
         self.queries = nn.Embedding(chunk, width)
         self.head = nn.Linear(width, action_dim)
@@ -266,11 +266,11 @@ class BenchACT(nn.Module):
 
     def decode(self, images: Tensor, states: Tensor, latent: Tensor, kept: Tensor) -> Tensor:
         """The actions of ``kept``, ``(B, T)`` with M of them true, as ``(M, D)``."""
-        maps = self.picture(self.backbone(images.unflatten(1, (-1, 3)).flatten(0, 1)))
+        maps = self.image_proj(self.backbone(images.unflatten(1, (-1, 3)).flatten(0, 1)))
         height, width = maps.shape[-2:]
         cameras = images.shape[1] // 3
-        pictures = maps.flatten(2).unflatten(0, (-1, cameras)).transpose(2, 3).flatten(1, 2)
-        x = torch.cat([self.from_latent(latent)[:, None], self.state(states)[:, None], pictures], 1)
+        patches = maps.flatten(2).unflatten(0, (-1, cameras)).transpose(2, 3).flatten(1, 2)
+        x = torch.cat([self.from_latent(latent)[:, None], self.state(states)[:, None], patches], 1)
         seen = Tokens(*x.shape[:2])
         grid = places_2d(height, width, maps.shape[1]).to(maps).repeat(cameras, 1)
         places = torch.cat([self.token_places.weight, grid]).repeat(len(x), 1)

@@ -89,7 +89,7 @@ class Samples:
             self.data = _of_family(setup)
             return
         s, rng = SIZES[setup.size], np.random.default_rng(0)
-        images = (POOL, 3 * s.cameras, s.picture, s.picture)
+        images = (POOL, 3 * s.cameras, s.image_size, s.image_size)
         chunk = (POOL, s.actions, s.action_dim)
         self.data = {
             "images": rng.integers(0, 256, images, np.uint8),

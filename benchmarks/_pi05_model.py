@@ -36,7 +36,7 @@ class Size:
     """Lengths and widths of everything; images are square, in pixels."""
 
     cameras: int = 2
-    picture: int = 224
+    image_size: int = 224
     patch: int = 14
     vision_width: int = 1152
     vision_inner: int = 4304
@@ -57,7 +57,7 @@ class Size:
     @property
     def patches(self) -> int:
         """Of one image."""
-        return (self.picture // self.patch) ** 2
+        return (self.image_size // self.patch) ** 2
 
     @property
     def prefix(self) -> int:
@@ -68,7 +68,7 @@ class Size:
 SIZES = {
     "pi05": Size(),
     "tiny": Size(
-        picture=28,
+        image_size=28,
         vision_width=32,
         vision_inner=48,
         vision_layers=2,
@@ -216,7 +216,7 @@ class ExpertLayer(Parts):
 
 @VLAS.register_module()
 class BenchPi05(nn.Module):
-    """Pictures and a prompt to a chunk of actions, by flow matching.
+    """Images and a prompt to a chunk of actions, by flow matching.
 
     Args:
         size: a name in ``SIZES``.
@@ -237,7 +237,7 @@ class BenchPi05(nn.Module):
         self.patch_places = nn.Parameter(0.02 * torch.randn(s.patches, s.vision_width))
         self.vision = nn.ModuleList(VisionBlock(s) for _ in range(s.vision_layers))
         self.vision_norm = LayerNorm(s.vision_width)
-        self.picture = nn.Linear(s.vision_width, s.width)
+        self.image_proj = nn.Linear(s.vision_width, s.width)
         self.words = nn.Parameter(torch.randn(s.words, s.width).mul_(s.width**-0.5))
         self.language = nn.ModuleList(LanguageLayer(s, i + 1 == s.layers) for i in range(s.layers))
         self.expert = nn.ModuleList(ExpertLayer(s) for _ in range(s.layers))
@@ -268,26 +268,26 @@ class BenchPi05(nn.Module):
         words = F.embedding(lang_tokens, self.words).to(x.dtype)
         x = torch.cat([x, words * self.size.width**0.5], 1)
         steps = self.action_in(torch.lerp(noise, actions, time[:, None, None])).to(x.dtype)
-        told = self.tell(time).to(x.dtype)
+        condition = self.embed_time(time).to(x.dtype)
         first_places, last_places, *both = self.layout(lang_masks, x)
         for language, expert in zip(self.language, self.expert, strict=True):
             x, key, value = language(x, first_places, both[0])
-            steps = expert(steps, key, value, told, last_places, both[1])
-        velocity = self.action_out(self.expert_norm(steps, told)[0])
+            steps = expert(steps, key, value, condition, last_places, both[1])
+        velocity = self.action_out(self.expert_norm(steps, condition)[0])
         return {"loss": (velocity.float() - (actions - noise)).square().mean()}
 
     def see(self, images: Tensor) -> Tensor:
         """``(B, 3N, P, P)`` uint8 -> ``(B, N * patches, W)``."""
-        side, patch = self.size.picture // self.size.patch, self.size.patch
+        side, patch = self.size.image_size // self.size.patch, self.size.patch
         x = images.unflatten(1, (-1, 3)).flatten(0, 1)
         x = x.unflatten(3, (side, patch)).unflatten(2, (side, patch)).permute(0, 2, 4, 1, 3, 5)
         x = self.patch(x.flatten(3).flatten(1, 2).float() / 127.5 - 1)
         x = x + self.patch_places.to(x.dtype)
         for block in self.vision:
             x = block(x)
-        return self.picture(self.vision_norm(x)).unflatten(0, (len(images), -1)).flatten(1, 2)
+        return self.image_proj(self.vision_norm(x)).unflatten(0, (len(images), -1)).flatten(1, 2)
 
-    def tell(self, time: Tensor) -> Tensor:
+    def embed_time(self, time: Tensor) -> Tensor:
         """``(B,)`` -> ``(B, W)``, by way of waves with periods from 4e-3 to 4 (openpi's)."""
         half = self.size.expert_width // 2
         part = torch.arange(half, device=time.device) / (half - 1)

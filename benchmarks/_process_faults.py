@@ -376,7 +376,7 @@ CONTROL = "control process"
 # ``halts``: what is received ends in the middle of a motion, at the last command.
 _FAULTS = [
     Fault(
-        "policy keeps the interpreter's lock for 5 s",
+        "policy holds the GIL for 5 s",
         order("keep the interpreter"),
         LOCKED,
         rule=MAIN,

@@ -142,7 +142,7 @@ class HarmfulSwing(Swing):
 
 @HOOKS.register_module()
 class BlockingHook:
-    """Blocks the thread that it is called in, once it is told to."""
+    """Blocks the thread that it is called in, once the policy asks for it."""
 
     def action_sent(self, action: Array) -> None:
         policy = HarmfulSwing.made
@@ -168,7 +168,7 @@ def in_policy(harm: Callable[[], object]) -> Callable[[HarmfulSwing], None]:
 
 
 def keep_interpreter() -> None:
-    """Native code that computes in one piece: PyDLL, unlike CDLL, keeps the interpreter's lock."""
+    """Native code that computes in one piece: PyDLL, unlike CDLL, holds the GIL."""
     ctypes.PyDLL(None).sleep(int(BLOCKED_S))
 
 
@@ -194,7 +194,7 @@ def use_all_memory() -> None:
 
 
 def stand_in_for_an_image_callback_that_spins(policy: HarmfulSwing) -> None:
-    """What stores an image keeps the interpreter's lock; none of ours does that."""
+    """What stores an image holds the GIL; none of ours does that."""
     add = Ring.add
 
     def spin(ring: Ring, receipt: float, stamp: float | None, message: Any) -> bool:

@@ -50,7 +50,7 @@ def version_of(distribution: str) -> str | None:
 
 
 def keep(out: Path, summary: Mapping[str, Any], *, show: bool = True) -> None:
-    """Write the results as JSON; print them, unless the benchmark tells them its own way."""
+    """Write the results as JSON; print them, unless the benchmark reports them itself."""
     text = json.dumps(summary, indent=1)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text + "\n", encoding="utf-8")

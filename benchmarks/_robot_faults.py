@@ -3,7 +3,7 @@
 ``FAULTS`` is the list; docs/safety.md has a row for each. A driver in a process of its own is the
 arm and its cameras, a second one only listens: what is judged is what that one received through
 DDS. ``Stage.play`` runs the real inference runner in this thread, provokes one fault once the arm
-moves, and tells what came of it.
+moves, and returns the result.
 """
 
 from __future__ import annotations

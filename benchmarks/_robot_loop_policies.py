@@ -51,7 +51,7 @@ class TenMillion:
 
 
 class LockHolder(TenMillion):
-    """Keeps the interpreter's lock half of the time, for ``LOCKED_S`` in one call."""
+    """Holds the GIL half of the time, for ``LOCKED_S`` in one call."""
 
     def __init__(self) -> None:
         super().__init__()

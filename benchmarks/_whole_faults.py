@@ -54,7 +54,7 @@ def play(folder: Path, fault: Fault) -> Result:
 
 _FAULTS = [
     Fault(
-        "policy keeps the interpreter's lock for 5 s",
+        "policy holds the GIL for 5 s",
         order("keep the interpreter"),
         LOCKED,
         rule=MAIN,
@@ -79,7 +79,7 @@ _FAULTS = [
         rule="freshness",
     ),
     Fault(
-        "get_frame() keeps the interpreter's lock for 5 s",
+        "get_frame() holds the GIL for 5 s",
         order("get_frame keeps the interpreter"),
         r"the control process did not run for 1\.\d s and was killed",
         rule=CONTROL,

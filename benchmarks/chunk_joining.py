@@ -51,7 +51,7 @@ JERK = 400.0
 class Wavering:
     """Swings the arms' joints; each chunk is shifted from the swing by up to ``offset`` rad.
 
-    Told to go on from a chunk, it keeps to that as far as it is told.
+    When it has to continue a chunk, it repeats the given part of that.
     """
 
     embodiment = aloha_spec(CAMERAS[:0], HZ)

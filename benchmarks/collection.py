@@ -47,10 +47,10 @@ from fluxvla_core.evaluation.worker import EpisodeWorker, Settings, run_in_pool
 from fluxvla_core.spec import Camera
 
 CAMERA = Camera("top", 144, 192)
-PICTURES = 10
+IMAGES = 10
 
 
-def pictures() -> dict[str, Callable[[], tuple[float, float]]]:
+def rendering() -> dict[str, Callable[[], tuple[float, float]]]:
     """Wall and processor milliseconds of one image, cheap and as the model file asks."""
 
     def side(quality: str) -> Callable[[], tuple[float, float]]:
@@ -60,10 +60,10 @@ def pictures() -> dict[str, Callable[[], tuple[float, float]]]:
 
         def measure() -> tuple[float, float]:
             wall, cpu = time.perf_counter(), time.process_time()
-            for _ in range(PICTURES):
+            for _ in range(IMAGES):
                 scene.render(CAMERA.name, CAMERA.height, CAMERA.width)
             taken = time.perf_counter() - wall, time.process_time() - cpu
-            return 1e3 * taken[0] / PICTURES, 1e3 * taken[1] / PICTURES
+            return 1e3 * taken[0] / IMAGES, 1e3 * taken[1] / IMAGES
 
         return measure
 
@@ -143,7 +143,7 @@ def main() -> int:
     args = parser.parse_args()
     begun = _results.head("fluxvla-sim", "mujoco", "gym-aloha")
     rounds, episodes = range(args.rounds), args.episodes
-    sides = pictures()
+    sides = rendering()
     drawn = [{name: measure() for name, measure in sides.items()} for _ in rounds]
     speed = [{n: collecting(n, episodes) for n in (1, 2)} for _ in rounds]
     own = [stock() for _ in rounds]

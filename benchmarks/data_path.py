@@ -50,7 +50,7 @@ def make_datasets(folder: Path, episodes: int, frames: int) -> None:
                 for t in range(frames):
                     state = np.sin(np.arange(JOINTS) + 0.05 * t + episode)
                     images = {
-                        c.name: picture(scene, t, i + 3 * episode) for i, c in enumerate(cameras)
+                        c.name: draw(scene, t, i + 3 * episode) for i, c in enumerate(cameras)
                     }
                     writer.add_frame(images, state, state + 0.01, "hold the cube")
                 writer.save_episode()
@@ -66,7 +66,7 @@ def make_scene() -> np.ndarray:
     return image.clip(0, 255).astype(np.uint8)
 
 
-def picture(scene: np.ndarray, t: int, which: int) -> np.ndarray:
+def draw(scene: np.ndarray, t: int, which: int) -> np.ndarray:
     """A still scene with an arm's worth of pixels that move through it."""
     image = scene[:, 31 * which : 31 * which + WIDTH].copy()
     left = (5 * t + 97 * which) % (WIDTH - 160)

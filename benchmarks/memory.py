@@ -117,8 +117,8 @@ def of_family(family: Family, activations: bool = True) -> dict[str, Any]:
             "per_device_num_workers": 0,
         }
         columns = [one for one in STRATEGIES if one.kind == kind]
-        told, trained, parameters = _of_config(tree, columns, activations)
-        found["bytes"] |= told
+        counted, trained, parameters = _of_config(tree, columns, activations)
+        found["bytes"] |= counted
         found["trained"][kind] = trained
         if kind == "full":
             found["parameters"] = parameters
@@ -142,10 +142,10 @@ def _of_config(
             kept[key] = NO_ACTIVATIONS if not activations else _kept(model, layout, runner, batch)
         state = optimizer_bytes(runner.optimizer_settings.build, layout.optimized)
         passing = kept[key] or NO_ACTIVATIONS
-        told = footprint(layout, passing, state, averaged=False, recompute=True).to_dict()
+        counted = footprint(layout, passing, state, averaged=False, recompute=True).to_dict()
         if kept[key] is None:
-            told["activations"] = told["total"] = None
-        found[column.title] = told
+            counted["activations"] = counted["total"] = None
+        found[column.title] = counted
     return found, built.trained, built.parameters
 
 
@@ -190,13 +190,13 @@ def table(families: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _cell(told: Mapping[str, Any] | None) -> str:
-    if told is None:
+def _cell(counted: Mapping[str, Any] | None) -> str:
+    if counted is None:
         return "–"
-    if told["total"] is None:
-        known = sum(v for k, v in told.items() if v is not None and k != "total")
+    if counted["total"] is None:
+        known = sum(v for k, v in counted.items() if v is not None and k != "total")
         return f"> {known / 1e9:.1f}"
-    return f"{told['total'] / 1e9:.1f}"
+    return f"{counted['total'] / 1e9:.1f}"
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ sides take turns, each in a process of its own:
 * ``fluxvla``: ``AlohaInferenceRunner`` with ``async_execution`` and every safety rule; a process of
   its own sends the commands.
 * ``recording``: the same with ``--record``: everything into a bag, images too.
-* ``lock held``: the same with a policy that keeps the interpreter's lock half of the time.
+* ``lock held``: the same with a policy that holds the GIL half of the time.
 * ``one process``, also ``recording`` and ``lock held``: with ``control_process=False``.
 * ``upstream``: the same policy and topics, driven as FluxVLA's ROS 1 operators and runners do it
   (rewritten for this): callbacks append raw messages to queues of 2000, the loop pops and
@@ -24,7 +24,7 @@ sides take turns, each in a process of its own:
 Jitter is how far the time between two commands is from 20 ms, at the sender; late is a command more
 than 2 ms behind its deadline (upstream: behind the one before it). Memory is the private memory
 that the process has more at its most than when it had loaded everything; ``--minutes`` runs our
-side for so long and tells whether it grows. Goals, on all three sides with a process of its own:
+side for so long and shows whether it grows. Goals, on all three sides with a process of its own:
 late < 0.1 %, jitter p99 < 0.3 ms, that process below 90 MB (its proportional memory: what it shares
 with the main process counts half) and 10 % of a core; no frame copied more than once; upstream's
 jitter p99 at least 5 times, and its memory at least 10 times ours. Loopback only. Writes
@@ -84,7 +84,7 @@ GOALS = {
 }
 OURS = ("fluxvla", "recording", "lock held")
 QUEUE = 2000
-PICTURES = 3 * 480 * 640 * 3
+FRAME_BYTES = 3 * 480 * 640 * 3
 
 
 class Memory:
@@ -144,10 +144,10 @@ def control_processes() -> list[int]:
 
 def drive() -> Driver:
     """The robot's side: cameras, joint states, and somebody who hears commands."""
-    picture = {"message": IMAGE, "hz": 30, "height": 480, "width": 640}
+    image = {"message": IMAGE, "hz": 30, "height": 480, "width": 640}
     arm = {"message": JOINT_STATE, "hz": 100, "names": list(COBOT_MAGIC.joints)}
     start = [*START_POSE[:6], COBOT_MAGIC.gripper_open]
-    streams = [{"topic": topic, **picture} for topic in COBOT_MAGIC.images]
+    streams = [{"topic": topic, **image} for topic in COBOT_MAGIC.images]
     streams += [
         {"topic": state, "positions": start, "follows": command, **arm}
         for state, command in zip(COBOT_MAGIC.states, COBOT_MAGIC.commands, strict=True)
@@ -239,7 +239,7 @@ def copies_per_frame(robot: AlohaOperator) -> float:
         tracemalloc.stop()
         time.sleep(0.005)
     robot.close()
-    return round(min(peaks) / PICTURES, 2)
+    return round(min(peaks) / FRAME_BYTES, 2)
 
 
 def upstream(seconds: float, prompt: float) -> dict[str, Any]:
@@ -339,9 +339,9 @@ def popped(queues: dict[str, deque[Any]]) -> dict[str, Any] | None:
         while stamp(queue[0]) < instant:
             queue.popleft()
         messages.append(queue.popleft())
-    pictures = [np.frombuffer(m.data, np.uint8).reshape(m.height, m.width, 3) for m in messages[:3]]
+    images = [np.frombuffer(m.data, np.uint8).reshape(m.height, m.width, 3) for m in messages[:3]]
     state = np.concatenate([np.array(m.position) for m in messages[3:]])
-    return {"qpos": state, "images": {str(n): p.copy() for n, p in enumerate(pictures)}}
+    return {"qpos": state, "images": {str(n): p.copy() for n, p in enumerate(images)}}
 
 
 SIDES: dict[str, Callable[[float, float], dict[str, Any]]] = {

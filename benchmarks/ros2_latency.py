@@ -43,9 +43,9 @@ WARM_UP = 5
 
 def drive() -> Driver:
     """The robot's side: cameras, joint states, and somebody who hears commands."""
-    picture = {"message": IMAGE, "hz": 30, "height": 480, "width": 640}
+    image = {"message": IMAGE, "hz": 30, "height": 480, "width": 640}
     arm = {"message": JOINT_STATE, "hz": 100, "names": list(COBOT_MAGIC.joints)}
-    streams = [{"topic": topic, **picture} for topic in COBOT_MAGIC.images]
+    streams = [{"topic": topic, **image} for topic in COBOT_MAGIC.images]
     streams += [{"topic": t, "positions": [0.0] * 6 + [1.0], **arm} for t in COBOT_MAGIC.states]
     sinks = [{"topic": topic, "message": JOINT_STATE} for topic in COBOT_MAGIC.commands]
     profile = {"FASTDDS_DEFAULT_PROFILES_FILE": large_frames_profile()}
@@ -101,12 +101,12 @@ def bare(seconds: float) -> dict[str, Any]:
     def observe() -> float:
         received = [newest[topic] for topic, _ in topics]
         messages = [message for _, message in received]
-        pictures = [
+        images = [
             np.frombuffer(m.data, np.uint8).reshape(m.height, m.width, 3).copy()
             for m in messages[:3]
         ]
         state = np.concatenate([np.array(m.position) for m in messages[3:]])
-        assert len(pictures) == 3
+        assert len(images) == 3
         assert state.shape == (14,)
         return received[0][0] - seconds_of(messages[0].header.stamp)
 

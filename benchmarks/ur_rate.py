@@ -77,8 +77,8 @@ def drive() -> Driver:
         {"topic": "/gripper/position", "message": FLOAT64, "hz": 50, "data": 0.5},
     ]
     for camera in ("front", "wrist"):
-        picture = {"message": IMAGE, "hz": 30, "height": 96, "width": 128}
-        streams.append({"topic": f"/{camera}_camera/color/image_raw", **picture})
+        image = {"message": IMAGE, "hz": 30, "height": 96, "width": 128}
+        streams.append({"topic": f"/{camera}_camera/color/image_raw", **image})
     sinks = [
         {"topic": topic, "message": message},
         {"topic": "/gripper/command", "message": FLOAT64},

@@ -160,7 +160,7 @@ def test_what_waits_for_a_hook_is_bounded(context, monkeypatch):
 
 
 def test_a_pause_of_the_whole_process_is_no_hooks_fault(context, monkeypatch):
-    """As of one that is stopped (SIGSTOP), or whose interpreter's lock somebody kept."""
+    """As of one that is stopped (SIGSTOP), or whose GIL somebody held."""
     sleeps = Sleeps(budget_s=5, seconds=0.3)
     caller = HookCaller(context, [("Sleeps", sleeps)])
     caller.call("after_step", step=1, metrics={"loss": 0.0})

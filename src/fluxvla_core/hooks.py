@@ -3,8 +3,8 @@
 They have methods of :class:`fluxvla_core.contracts.runner.Hook`. pluggy checks names and arguments
 and calls them, each hook in a thread of its own: the run queues a call and continues. A hook that
 raises, ends its thread or falls behind is reported once and left out for the rest of the run: an
-observer must never end, or delay, a training or a motion. It can still keep the interpreter's lock
-or end the process.
+observer must never end, or delay, a training or a motion. It can still hold the GIL or end the
+process.
 """
 
 from __future__ import annotations

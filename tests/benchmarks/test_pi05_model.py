@@ -26,10 +26,10 @@ def model() -> BenchPi05:
 @pytest.fixture
 def batch() -> dict[str, Tensor]:
     rng = torch.Generator().manual_seed(1)
-    pictures = (BATCH, 3 * S.cameras, S.picture, S.picture)
+    shape = (BATCH, 3 * S.cameras, S.image_size, S.image_size)
     chunk = (BATCH, S.actions, S.action_dim)
     return {
-        "images": torch.randint(0, 256, pictures, generator=rng, dtype=torch.uint8),
+        "images": torch.randint(0, 256, shape, generator=rng, dtype=torch.uint8),
         "lang_tokens": torch.randint(0, S.words, (BATCH, S.prompt), generator=rng),
         "lang_masks": torch.arange(S.prompt) < torch.tensor([[4], [S.prompt], [7]]),
         "actions": torch.randn(chunk, generator=rng),

@@ -90,7 +90,8 @@ def test_a_flipped_bit_in_any_file_is_named(tmp_path):
             message = str(caught.value)
             assert f"{name} is damaged" in message or "fluxvla-checkpoint" in message
             assert str(name) in message
-            assert f"the one before it is whole: {tmp_path}/checkpoints/step-000000001" in message
+            before = f"{tmp_path}/checkpoints/step-000000001"
+            assert f"the one before it is undamaged: {before}" in message
         (newest / name).write_bytes(whole)
     Checkpoint.open(newest).verify()
 
@@ -125,7 +126,7 @@ def test_a_file_that_cannot_be_read_is_named_and_passed_over(tmp_path, monkeypat
     assert str(caught.value) == (
         f"{second}: model.safetensors cannot be read: Input/output error\n"
         "  likely cause: its permissions, or a disk or mount that fails\n"
-        f"  next: the one before it is whole: {first}"
+        f"  next: the one before it is undamaged: {first}"
     )
 
 

@@ -107,7 +107,7 @@ def test_show(fluxvla: Fluxvla, arm: Install) -> None:
             "  contract     operators 1.0\n"
             "  about        Moves things.\n"
             "  process      runs as a whole in a process of its own, which sends commands and also "
-            "copies its images: its own code that keeps the interpreter's lock delays commands\n"
+            "copies its images: code of its own that holds the GIL delays commands\n"
             "  keys\n"
             "    port: str   [required]\n"
             "    rate: int = 30\n"

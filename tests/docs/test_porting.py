@@ -34,7 +34,7 @@ def owners(name: str) -> set[str]:
 
 NAMES = [
     (name, there)
-    for theirs, there in rows("Every name, and where it lives")
+    for theirs, there in rows("Names and where they are")
     for name in re.findall(r"`([A-Z]\w+)`", theirs)
 ]
 

@@ -51,7 +51,7 @@ def said(name: str) -> str:
         (
             "class URArms: ...",
             "acme-ur 0.3: entry point URArm = 'acme_ur:URArm' names an object that does not exist\n"
-            "  next: reinstall acme-ur, or tell its author",
+            "  next: reinstall acme-ur, or report it to its author",
         ),
         (
             "class URArm:\n    api = '1.3'\n    def get_frame(self): ...",

@@ -133,7 +133,7 @@ def test_joints_are_found_by_name_in_a_state_of_its_own():
     spec = replace(ARM, state_joints=(ARM.joints[2], ARM.joints[0], ARM.joints[1]))
 
     np.testing.assert_array_equal(action_columns(spec), [1, 2, 0])
-    with pytest.raises(SafetyStop, match="the state of arm does not tell where slide, jaw is"):
+    with pytest.raises(SafetyStop, match="the state of arm does not contain slide, jaw"):
         action_columns(replace(ARM, state_joints=(ARM.joints[0],)))
 
 

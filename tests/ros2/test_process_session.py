@@ -24,7 +24,7 @@ def stage(tmp_path):
 
 
 class Hogging(Swing):
-    """Keeps the interpreter's lock in one of its answers, in motion."""
+    """Holds the GIL in one of its answers, in motion."""
 
     left = -1
 

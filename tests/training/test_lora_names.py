@@ -97,7 +97,7 @@ def trained_whole(model):
             "head",
             "action_head",
             [],
-            "no name tells 'head' apart: give it another one in the model, or name those too",
+            "'head' has no ending that is its own: rename it in the model, or name those too",
         ),
     ],
 )

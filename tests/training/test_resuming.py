@@ -105,7 +105,7 @@ def test_a_damaged_newest_one_is_named_and_passed_over_by_auto_and_refused_by_pa
     with pytest.raises(CheckpointError) as caught:
         make(tmp_path / "hurt", resume=str(newest)).run_setup(37)
     assert "model.safetensors is damaged" in str(caught.value)
-    assert f"the one before it is whole: {folders(tmp_path / 'hurt')[-2]}" in str(caught.value)
+    assert f"the one before it is undamaged: {folders(tmp_path / 'hurt')[-2]}" in str(caught.value)
     said = Said()
     run(tmp_path / "hurt", resume="auto", reporter=said, save_iter_interval=2, max_keep_ckpts=0)
     assert said.lines[0].startswith(

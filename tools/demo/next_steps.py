@@ -52,7 +52,7 @@ def next_steps(size: Size, places: Places, steps: int) -> list[Next]:
             _set("eval.episodes=1", "eval.baseline=false", "eval.instruction_swap=false"),
         ),
         Next(
-            "tell it otherwise",
+            "other instruction",
             (*run, "inference", "--work-dir", work, "--task", OTHER_TASK),
             _set("inference.max_publish_step=20"),
         ),

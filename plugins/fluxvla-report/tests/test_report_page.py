@@ -228,7 +228,7 @@ def test_latencies_of_simulated_time_are_left_out(tmp_path: Path, complete: Path
 
     assert page.shows("Time was simulated")
     assert not page.shows("Latency by stage")
-    assert not page.shows("reading to command")
+    assert not page.shows("observation to command")
 
 
 def test_a_summary_alone_says_that_time_was_simulated(tmp_path: Path, complete: Path) -> None:

@@ -1,7 +1,7 @@
 """A saved checkpoint as one object, and the checkpoints of a work dir as a list.
 
-Nothing here needs torch or a runner until weights are asked for: a command that lists checkpoints
-and a robot that reads an embodiment use the same door as the trainer.
+Nothing here imports torch before weights are read: commands that list checkpoints and robots that
+read an embodiment use these functions too.
 
     <work_dir>/checkpoints/step-000000100/
         manifest.json            sizes and SHA-256 of everything below
@@ -131,7 +131,7 @@ class Checkpoint:
 
         Raises:
             CheckpointError: names the first file that is missing, cut short, changed or cannot be
-                read, and offers the newest earlier checkpoint that is whole.
+                read, and offers the newest earlier checkpoint that is undamaged.
         """
         damage = self._damage()
         if damage is not None:
@@ -301,13 +301,13 @@ def newest_undamaged(place: str | Path) -> tuple[Checkpoint | None, list[Checkpo
     refused: list[CheckpointError] = []
     for folder in reversed(folders(place)):
         try:
-            return _whole(folder), refused
+            return _verified(folder), refused
         except CheckpointError as error:
             refused.append(error)
     return None, refused
 
 
-def _whole(folder: Path) -> Checkpoint:
+def _verified(folder: Path) -> Checkpoint:
     """The verified checkpoint in ``folder``; if it is damaged, no other one is looked for."""
     checkpoint = Checkpoint(folder, read_manifest(folder))
     damage = checkpoint._damage()
@@ -322,7 +322,7 @@ def _offer_previous(path: Path) -> str | None:
     for folder in reversed(folders(path.parent)):
         if step is not None and (step_of(folder) or 0) < step:
             with suppress(CheckpointError):
-                return f"the one before it is whole: {_whole(folder).path}"
+                return f"the one before it is undamaged: {_verified(folder).path}"
     return None
 
 

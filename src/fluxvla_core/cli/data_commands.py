@@ -152,7 +152,7 @@ class Finish:
 
         for path in find_recordings(args.recording):
             done = finish_recording(path)
-            say(f"{path}: {'finished' if done else 'is whole'}")
+            say(f"{path}: {'finished' if done else 'is complete'}")
         return 0
 
 

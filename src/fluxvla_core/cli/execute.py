@@ -48,8 +48,8 @@ def execute(plan: Plan, args: argparse.Namespace) -> int:
         return _run_section(plan, build_runner_from_cfg, context)[1]
     reporter = KeepAliveReporter(make_reporter(args.log_format))
     try:
-        with _claimed(plan, reporter):
-            first = _leave_records(plan)
+        with _work_dir_lock(plan, reporter):
+            first = _write_run_records(plan)
             reporter.event("start", section=plan.section, work_dir=plan.work_dir)
             for text in ranks.restart_notice():
                 reporter.warn(text)
@@ -71,7 +71,7 @@ def execute(plan: Plan, args: argparse.Namespace) -> int:
         reporter.close()
 
 
-def _claimed(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
+def _work_dir_lock(plan: Plan, reporter: Reporter) -> AbstractContextManager[object]:
     """Lock the work dir of a training, before its first file is written there."""
     if not plan.trains:
         return nullcontext()
@@ -134,7 +134,7 @@ def _train(plan: Plan, runner: Any, context: Any) -> tuple[Any, int]:
         raise known from error
 
 
-def _leave_records(plan: Plan) -> bool:
+def _write_run_records(plan: Plan) -> bool:
     """``config.resolved.json`` and ``environment.json`` at the top of the work dir, and whether
     they were written: a training's own stay when something is evaluated there later."""
     if not plan.trains and (plan.work_dir / CONFIG_FILE).exists():

@@ -173,7 +173,7 @@ def _process(plugin: Plugin) -> str:
         return "can be divided: commands are sent from a process of its own"
     return (
         "runs as a whole in a process of its own, which sends commands and also copies its images: "
-        "its own code that keeps the interpreter's lock delays commands"
+        "code of its own that holds the GIL delays commands"
     )
 
 

@@ -29,7 +29,7 @@ from fluxvla_core.errors import EXIT_BAD_INPUT, FluxError, UsageError
 from fluxvla_core.plugins.registry import load_plugin_files
 
 EVALUATION = "eval"
-_OF_A_RANK = re.compile(
+_RANK_VARIABLES = re.compile(
     r"(MASTER|TORCHELASTIC|GROUP|ROLE)_.*|(LOCAL_)?(RANK|WORLD_SIZE)|TORCH_NCCL_ASYNC_HANDLING"
 )
 """Environment variables that torch's launcher sets for its ranks."""
@@ -268,7 +268,7 @@ def _evaluate(argv: list[str], late: int = 0) -> None:
             sys.stderr,
         )
         return
-    environment = {n: value for n, value in os.environ.items() if not _OF_A_RANK.fullmatch(n)}
+    environment = {n: value for n, value in os.environ.items() if not _RANK_VARIABLES.fullmatch(n)}
     sys.stdout.flush()
     sys.stderr.flush()
     os.execve(sys.executable, [sys.executable, "-m", "fluxvla_core", *argv], environment)

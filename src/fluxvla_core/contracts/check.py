@@ -99,7 +99,7 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
     problems += _wrong(
         contract, cls, {m: n for m, n in named.items() if _lookup(contract, cls, m) is not None}
     )
-    problems += _halves(contract, cls)
+    problems += _incomplete_groups(contract, cls)
     if problems:
         raise LoadFailed(
             f"{origin}: {name} does not fulfil the contract of fluxvla.{registry}: "
@@ -108,7 +108,7 @@ def check_class(registry: str, cls: Any, origin: str) -> None:
         )
 
 
-def _halves(contract: type[Contract], cls: type) -> list[str]:
+def _incomplete_groups(contract: type[Contract], cls: type) -> list[str]:
     """Problems with groups of methods that ``cls`` has only in part."""
     problems = []
     for group in contract._together:

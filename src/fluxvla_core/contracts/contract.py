@@ -83,7 +83,7 @@ class Contract(metaclass=ABCMeta):
         if isinstance(made, cls):
             return made
         made = original(made)
-        body = {name: _hand_on(name) for name in public_methods(cls) if name.startswith("__")}
+        body = {name: _delegating(name) for name in public_methods(cls) if name.startswith("__")}
         kind = type(type(made).__name__, (_Adapter, cls), {**body, "__module__": __name__})
         setattr(kind, "__abstractmethods__", frozenset())  # noqa: B010 - unknown to type checkers
         return cast(C, kind(made, cls))
@@ -157,7 +157,7 @@ class _Adapter:
         return repr(object.__getattribute__(self, "_made"))
 
 
-def _hand_on(name: str) -> Any:
+def _delegating(name: str) -> Any:
     def call(self: Any, *arguments: Any, **keywords: Any) -> Any:
         return getattr(original(self), name)(*arguments, **keywords)
 

@@ -78,7 +78,7 @@ class EnvironmentSpec:
         """The tasks called ``names``, in their order; all of them for None.
 
         Raises:
-            ConfigError: there is not one of that name, or one is named twice.
+            ConfigError: there is none of that name, or one is named twice.
         """
         if names is None:
             return self.tasks

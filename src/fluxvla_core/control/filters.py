@@ -128,7 +128,7 @@ class WorkspaceBox(ActionFilter):
 
     The box holds for targets, and an arm that comes at a wall with speed needs its braking way
     behind it: up to ``v^2 / 2A`` in each joint, which on a UR (pi rad/s^2) is a centimetre at the
-    tool at 0.3 m/s and ten at 0.5 m/s. Make the box smaller than the room by that much, or
+    tool at 0.3 m/s and ten at 0.5 m/s. Make the box smaller than the allowed space by that much, or
     ``safety.velocity_scale`` small. The way to the start pose is not boxed.
 
     Args:

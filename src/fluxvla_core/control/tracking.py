@@ -115,7 +115,7 @@ def action_columns(embodiment: EmbodimentSpec) -> npt.NDArray[np.intp]:
     missing = [j.name for j in embodiment.joints if j.name not in names and not j.by_speed]
     if missing:
         raise BadFrame(
-            f"the state of {embodiment.name} does not tell where {', '.join(missing)} is; "
+            f"the state of {embodiment.name} does not contain {', '.join(missing)}; "
             "a joint that cannot be read back cannot be moved safely"
         )
     places = [names.index(n) if n in names else -1 for n in embodiment.joint_names]

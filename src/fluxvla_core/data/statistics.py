@@ -79,7 +79,7 @@ def moments(chunks: Iterable[npt.NDArray[Any]]) -> Moments:
     """Moments of all rows of all non-empty ``(n, D)`` chunks.
 
     Raises:
-        ValueError: there is not one row.
+        ValueError: there are no rows.
     """
     total: Moments | None = None
     for chunk in chunks:

@@ -58,7 +58,7 @@ class PolicySource:
         """Refuse what the model cannot be asked to do here, before anything is loaded.
 
         Raises:
-            ConfigError: ``execution`` or ``quantization`` is unknown, or cannot be had here.
+            ConfigError: ``execution`` or ``quantization`` is unknown, or not available here.
         """
         if self.execution == "eager" and self.quantization is None:
             return  # without torch, which a process that serves no policy does not import

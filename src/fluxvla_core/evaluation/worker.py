@@ -83,7 +83,7 @@ class EpisodeWorker:
 
     Raises:
         SpecMismatch: the policy is for another robot, or wants cameras that are not there.
-        FluxError: environment or policy cannot be had.
+        FluxError: the environment cannot be built, or the policy not be loaded.
     """
 
     def __init__(self, settings: Settings, link: Connection | None = None) -> None:

@@ -253,7 +253,7 @@ def load(plugin: Plugin) -> Any:
             raise LoadFailed(
                 f"{plugin.origin}: entry point {plugin.name} = {plugin.value!r} names an object "
                 "that does not exist",
-                next=f"reinstall {plugin.dist}, or tell its author",
+                next=f"reinstall {plugin.dist}, or report it to its author",
             )
         found = getattr(found, part)
     return found

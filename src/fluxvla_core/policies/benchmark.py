@@ -204,7 +204,7 @@ def untrained_policy(
 
 
 def inference_work(policy: LocalPolicy, observation: Observation) -> dict[str, Work]:
-    """What one answer computes, by stage on the device, counted in it; tables are no part of it."""
+    """Operations and bytes of one answer, by stage on the device; without the step tables."""
     import torch
 
     from fluxvla_core.policies.execution import Eager

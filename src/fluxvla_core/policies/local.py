@@ -61,7 +61,7 @@ class LocalPolicy(Policy):
         execution: ``eager``, ``compiled`` or ``graph``: see ``policies.execution``.
 
     Raises:
-        ConfigError: a precision or an execution is unknown, or cannot be had here.
+        ConfigError: a precision or an execution is unknown, or not available here.
 
     A model's ``n_obs_steps`` is the policy's: with more than one, what it is asked with has to have
     a ``history``, whose observations are prepared one by one as the present one is.
@@ -132,7 +132,7 @@ class LocalPolicy(Policy):
         """Answer as ``execution`` says from now on; a model whose blocks are compiled stays so.
 
         Raises:
-            ConfigError: it is unknown, or cannot be had for this model or on this machine.
+            ConfigError: it is unknown, or not available for this model or on this machine.
         """
         from fluxvla_core.policies.execution import execution_of
 

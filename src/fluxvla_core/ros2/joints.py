@@ -41,8 +41,7 @@ def _columns(sent: tuple[str, ...], count: int, names: tuple[str, ...], source: 
     """Index of each joint in a message that has the names ``sent`` and ``count`` positions."""
     if not sent:
         raise BadMessage(
-            f"{source}: {count} positions without joint names; "
-            "joints are only ever told apart by name",
+            f"{source}: {count} positions without joint names; joints are identified by name alone",
             next="let the driver fill JointState.name",
         )
     if count != len(sent):

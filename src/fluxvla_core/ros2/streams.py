@@ -21,7 +21,7 @@ not matched in time with the others."""
 # Long enough to find the state that belongs to an image that took 0.2 s, at 500 Hz.
 _STATE_DEPTH = 128
 # Images are large; the newest few are enough to match cameras with one another.
-_PICTURE_DEPTH = 4
+_IMAGE_DEPTH = 4
 # Messages that wait in the middleware while the ROS thread is busy elsewhere.
 _QUEUE = 10
 STEP = 1.0
@@ -85,7 +85,7 @@ def camera_stream(
         topic=topic,
         message=COMPRESSED_IMAGE if packed else IMAGE,
         kind=DEPTH if depth else CAMERA,
-        depth=_PICTURE_DEPTH,
+        depth=_IMAGE_DEPTH,
         expected_hz=expected_hz,
         camera=camera,
     )

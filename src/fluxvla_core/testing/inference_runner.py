@@ -240,7 +240,7 @@ class InferenceRunnerConformance(Conformance):
             problem = error
         assert isinstance(problem, FluxError), (
             f"--task {task!r} gave {problem!r}, expected an error of fluxvla_core.errors: a "
-            "misspelt task is told in one line, and the policy is not asked for another one"
+            "misspelt task is reported in one line, and the policy does not do another one"
         )
         moved = [event for event in robot.events if event in (CONNECT, COMMAND)]
         assert not moved, (

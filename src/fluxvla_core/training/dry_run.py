@@ -127,7 +127,7 @@ def dry_run(context: RunContext, processes: Sequence[int] = PROCESSES) -> DryRun
 
 
 def _declared(context: RunContext) -> Mapping[str, Declared]:
-    """What the model's class says about the sizes of its batches; nothing if it cannot be had."""
+    """The sizes of batches that the model's class declares; empty if it cannot be loaded."""
     try:
         return declared_sizes(context.config["model"])
     except FluxError:

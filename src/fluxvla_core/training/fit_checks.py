@@ -27,7 +27,7 @@ from fluxvla_core.training.input_sizes import (
 )
 
 _OBSERVATIONS = {"n_obs_steps": 1, "past_actions": 0}
-"""What a model takes that does not say."""
+"""Defaults for a model that does not declare them."""
 _PARTS = ("vision_backbone", "projector", "llm_backbone", "vlm_backbone", "vla_head")
 _BY_FILE = "of weights that have the same names all the same, name the file itself"
 _DATA = {"train_dataloader": "the data", "val_dataloader": "the validation data"}

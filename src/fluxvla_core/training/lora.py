@@ -281,7 +281,7 @@ def _longer_names(names: Sequence[str], end: str) -> str:
         tails = (".".join(parts[i:]) for i in reversed(range(len(parts))))
         tail = next((tail for tail in tails if not _also_hit(names, tail)), None)
         if tail is None:
-            return f"no name tells {name!r} apart: give it another one in the model"
+            return f"{name!r} has no ending that is its own: rename it in the model"
         tails_found.append(repr(tail))
     return f"write {_listed(tails_found)} instead"
 

@@ -169,7 +169,7 @@ def restore_rng(world: World, checkpoint: Checkpoint | None, seed: int) -> None:
 
 
 TABLES = ("model", "train_dataloader", "val_dataloader")
-"""What a run, and its best checkpoint, follow from, besides the section that runs."""
+"""Tables of a config that decide about the result of a run, besides the section that runs."""
 HARMLESS = frozenset(
     {
         # Where things are. A model's frozen weights are compared by their hash, data by statistics.

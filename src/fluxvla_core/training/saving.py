@@ -186,7 +186,7 @@ def described_as_json(config: Any) -> Any:
 
 
 def _described(value: Any) -> str:
-    """Where it lies in memory is another place in every process."""
+    """``repr`` without the memory address, which differs between processes."""
     return _ADDRESS.sub("", repr(value))
 
 

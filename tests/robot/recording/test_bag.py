@@ -190,7 +190,7 @@ def test_the_command_finishes_all_in_a_folder(
     assert main(["data", "finish", str(folder.parent)]) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"{folder}: finished",
-        f"{folder.parent / '002-1'}: is whole",
+        f"{folder.parent / '002-1'}: is complete",
     ]
     assert main(["data", "finish", str(folder / "001-1.mcap")]) == 2
     assert "only an episode's folder with a bag can be finished" in capsys.readouterr().err

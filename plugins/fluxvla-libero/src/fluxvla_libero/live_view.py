@@ -29,7 +29,7 @@ class LiveView:
         url: where to look.
 
     Raises:
-        RunFailed: the port cannot be had.
+        RunFailed: the port is not available.
     """
 
     def __init__(self, port: int) -> None:

@@ -224,7 +224,7 @@ def _episode_tiles(episodes: Sequence[Episode]) -> list[dict[str, str]]:
     if totals:
         found.append(
             {
-                "name": "reading to command",
+                "name": "observation to command",
                 "figure": milliseconds(totals[-1]),
                 "detail": "sum of the stages' medians",
             }

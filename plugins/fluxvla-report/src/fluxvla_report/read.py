@@ -225,7 +225,7 @@ def _provenance(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _made(table: Mapping[str, Any]) -> str:
-    """When an evaluation ran, of which commit, and with which versions of what matters most."""
+    """Date, commit and the most important versions of an evaluation, as a line."""
     date = str(table.get("date") or "").replace("T", " ").replace("+00:00", " UTC")
     commit, mark, changes = str(table.get("commit") or "").partition("+")
     named = [

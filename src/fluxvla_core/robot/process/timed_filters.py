@@ -28,7 +28,7 @@ SHARE = 0.5
 """Share of the control period that all timed filters together may take: no command is later than
 that, and none is skipped."""
 MOST_LATE = 3
-"""Commands in a row of which a filter may be left out; the last of them is not sent."""
+"""Late commands in a row after which the arm is stopped; the last of them is not sent."""
 RESET_S = 0.5
 """How long ``reset`` may take. The control process sends nothing meanwhile; one that does not run
 for a second is killed."""

@@ -1,4 +1,4 @@
-"""RecordedEpisode episodes as a LeRobot v3.0 dataset, to train on what a robot did.
+"""Recorded episodes as a LeRobot v3.0 dataset, to train on what a robot did.
 
 A row is what was known at its time: the newest state and images that had arrived. Its action is
 the command that the robot had one row later, where the joints were to be by then: demonstrations

@@ -122,7 +122,7 @@ class InSimulation(RosOperator):
     def get_frame(self) -> RobotFrame:
         """As the robot's operator; receipt stamps are on ``clock``.
 
-        The part without commands is not told of a new episode, and so raises Stale until every
+        The part without commands does not begin episodes itself, and so raises Stale until every
         stream shows it.
         """
         if self._connection is not None and not self._part.commands and not self._shows_episode():

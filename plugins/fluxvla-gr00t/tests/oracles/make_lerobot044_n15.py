@@ -10,7 +10,8 @@ Eagle model with transformers' SigLIP and Qwen3, as its own constructor does; th
 a config and insists on flash attention, which a CPU has not.
 
 It computes in float64 and stores float32: two processors' float32 differ by up to 1e-5 of a
-gradient, and so would a file that was computed in float32.
+gradient, and so would a file that was computed in float32. ``bf16.`` is what it gives in float32
+with autocast to bfloat16.
 """
 
 from __future__ import annotations
@@ -205,6 +206,33 @@ def results(padded: bool) -> dict[str, torch.Tensor]:
     return found
 
 
+def lowered(padded: bool) -> dict[str, torch.Tensor]:
+    """Features, loss and sampled actions by autocast to bfloat16."""
+    model = Tiny().float()
+    noise = numbers("noise", (2, 6, 5)).float()
+    time = torch.from_numpy(fill.uniform("time", (2,)))
+    seen, given, asked = (
+        BatchFeature({name: _float(value) for name, value in table.items()})
+        for table in (inputs(padded), batch(padded), batch(False))
+    )
+    with (
+        torch.no_grad(),
+        torch.autocast("cpu", torch.bfloat16),
+        mock.patch.object(torch, "randn", return_value=noise),
+        mock.patch.object(model.action_head, "sample_time", return_value=time),
+    ):
+        features = model.backbone(seen)
+        found = {"features": features["backbone_features"]}
+        found["loss"] = model.action_head(features, given)["loss"]
+        actions = model.action_head.get_action(model.backbone(seen), asked)
+        found["actions"] = actions["action_pred"]
+    return found
+
+
+def _float(value: torch.Tensor | None) -> torch.Tensor | None:
+    return value.float() if value is not None and value.is_floating_point() else value
+
+
 def main(folder: Path) -> None:
     torch.set_num_threads(1)
     found = {
@@ -212,6 +240,9 @@ def main(folder: Path) -> None:
         for case, padded in (("even", False), ("padded", True))
         for name, value in results(padded).items()
     }
+    for case, padded in (("even", False), ("padded", True)):
+        for name, value in lowered(padded).items():
+            found[f"bf16.{case}.{name}"] = value.float().contiguous()
     about = {name: version(name) for name in ("lerobot", "transformers", "torch", "diffusers")}
     folder.mkdir(parents=True, exist_ok=True)
     save_file(found, folder / "lerobot044_n15.safetensors", about)

@@ -106,6 +106,8 @@ def test_under_nohup_a_closed_terminal_changes_nothing(form: str) -> None:
 
 @pytest.mark.parametrize("form", ["plain", "nproc"])
 def test_sigquit_ends_a_training_at_once_without_saving(form: str) -> None:
+    # A script that runs the tests in its background has them, and their children, ignore it.
+    signal.signal(signal.SIGQUIT, signal.SIG_DFL)
     with Job(form, workers=1) as job:
         job.train(3)
         pids = job.processes()

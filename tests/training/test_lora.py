@@ -419,44 +419,6 @@ def test_names_of_the_config_replace_those_of_the_model(naming):
     assert (found.target_modules, found.modules_to_save) == (("linear",), ("blocks.0",))
 
 
-class Nested(torch.nn.Module):
-    """Its projector is a module with a projector inside."""
-
-    def __init__(self, whole=True):
-        super().__init__()
-        self.linear, self.projector = torch.nn.Linear(3, 3), torch.nn.Module()
-        self.projector.projector = torch.nn.Linear(3, 3)
-        if not whole:
-            self.projector.norm = torch.nn.LayerNorm(3)
-
-    def forward(self, x):
-        return self.projector.projector(self.linear(x))
-
-
-NESTED = LoraOptions(2, ("linear",), modules_to_save=("projector",))
-
-
-def test_a_module_with_one_of_its_name_inside_is_trained():
-    """peft wraps both, and its outer copy, which is used, stays as it is."""
-    model = Nested()
-    options = NESTED.for_model(model)
-    assert options.modules_to_save == ("projector.projector",)
-    assert options.for_model(model) == options
-    lora.attach(model, NESTED)
-    model(torch.ones(2, 3)).sum().backward()
-    trained = {n: p.grad for n, p in model.named_parameters() if p.requires_grad}
-    assert {n for n in trained if "projector" in n} == {
-        f"projector.projector.modules_to_save.default.{name}" for name in ("weight", "bias")
-    }
-    assert all(grad is not None for grad in trained.values())
-
-
-def test_a_module_that_is_more_than_the_one_inside_is_refused():
-    words = "'projector' hits 'projector' and, inside it, projector.projector"
-    with pytest.raises(ConfigError, match=words):
-        lora.attach(Nested(whole=False), NESTED)
-
-
 def test_options_for_a_model_that_names_none():
     options = LoraOptions.read({"rank": 2}, None, declared=True)
     with pytest.raises(ConfigError, match=r"a\.py:3: runner\.lora: lora needs 'target_modules'"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from torch import nn
 
 from fluxvla_core.errors import ConfigError
@@ -127,3 +128,41 @@ def test_a_checkpoint_that_was_trained_with_such_a_name_still_loads():
     model = Heads("head", "action_head")
     lora.attach(model, options, trained=True)
     assert "action_head.modules_to_save.default.bias" in lora.adapter_names(model)
+
+
+class Nested(nn.Module):
+    """Its projector is a module with a projector inside."""
+
+    def __init__(self, whole=True):
+        super().__init__()
+        self.linear, self.projector = nn.Linear(3, 3), nn.Module()
+        self.projector.projector = nn.Linear(3, 3)
+        if not whole:
+            self.projector.norm = nn.LayerNorm(3)
+
+    def forward(self, x):
+        return self.projector.projector(self.linear(x))
+
+
+NESTED = LoraOptions(2, ("linear",), modules_to_save=("projector",))
+
+
+def test_a_module_with_one_of_its_name_inside_is_trained():
+    """peft wraps both, and its outer copy, which is used, stays as it is."""
+    model = Nested()
+    options = NESTED.for_model(model)
+    assert options.modules_to_save == ("projector.projector",)
+    assert options.for_model(model) == options
+    lora.attach(model, NESTED)
+    model(torch.ones(2, 3)).sum().backward()
+    trained = {n: p.grad for n, p in model.named_parameters() if p.requires_grad}
+    assert {n for n in trained if "projector" in n} == {
+        f"projector.projector.modules_to_save.default.{name}" for name in ("weight", "bias")
+    }
+    assert all(grad is not None for grad in trained.values())
+
+
+def test_a_module_that_is_more_than_the_one_inside_is_refused():
+    words = "'projector' hits 'projector' and, inside it, projector.projector"
+    with pytest.raises(ConfigError, match=words):
+        lora.attach(Nested(whole=False), NESTED)

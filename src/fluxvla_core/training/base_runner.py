@@ -191,8 +191,7 @@ class BaseTrainRunner(Strategy):
         if self.lora is not None:
             self.adapter_base = adapter_base_to_record(before, init_from)
             where = self.context.where(f"{self.context.section}.lora")
-            self.lora = self.lora.for_model(vla, where)
-            lora.attach(vla, self.lora, where)
+            self.lora = lora.attach(vla, self.lora, where)
         self.flops = Meter.of(vla, self.world.device, self.compute_dtype, options.peak_tflops)
         if options.enable_gradient_checkpointing:
             checkpoint_activations(vla)

@@ -186,11 +186,14 @@ def check_installed(where: str | None) -> None:
 
 def attach(
     model: nn.Module, options: LoraOptions, where: str | None = None, trained: bool = False
-) -> None:
+) -> LoraOptions:
     """Freeze ``model`` and put trainable adapters into it, drawn from torch's generator.
 
     Args:
         trained: the adapter is a checkpoint's: what its names hit in training they hit again.
+
+    Returns:
+        The options with the names that were used, see ``LoraOptions.for_model``.
 
     Raises:
         ConfigError: no module has such a name, one is of a kind that takes no adapter or shares
@@ -216,6 +219,7 @@ def attach(
             next=f"the model has {_leaf_names(model)}",
         ) from error
     _check_untied(model, tied, where)
+    return options
 
 
 def _check_found(model: nn.Module, options: LoraOptions, where: str | None) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from fluxvla_models.guidance import Guide
+from fluxvla_models.widths import check_prefix_len
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
@@ -100,13 +101,7 @@ class GR00T(VLA, nn.Module):
             ConfigError: inputs of another shape; ``prefix_len`` without ``prefix_conditioning``, or
                 the reverse.
         """
-        if self.prefix_conditioning != (prefix_len is not None):
-            raise ConfigError(
-                f"prefix_conditioning is {self.prefix_conditioning}, and the batch has "
-                f"{'no' if prefix_len is None else 'a'} prefix_len",
-                next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
-                "prefix_len among the collator's keys, belong to prefix_conditioning=True",
-            )
+        check_prefix_len(self.prefix_conditioning, prefix_len)
         context = self._context(images, lang_tokens, lang_masks, img_masks)
         ids = self._ids(states, embodiment_ids)
         errors = self.vla_head.errors(context, states, ids, actions, noise, time, prefix_len)

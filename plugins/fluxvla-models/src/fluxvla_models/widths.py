@@ -1,4 +1,4 @@
-"""Widths of a batch, compared with the model's."""
+"""What a batch has, compared with what the model takes: widths, and actions that are given."""
 
 from __future__ import annotations
 
@@ -45,4 +45,23 @@ def check_actions(
             cause="the model was made for another robot, or action_window_size is another",
             next="let train_dataloader.dataset.action_window_size be the model's horizon, and the "
             "width of the (padded) actions the model's",
+        )
+
+
+def check_prefix_len(prefix_conditioning: bool, prefix_len: Tensor | None) -> None:
+    """Check that a training batch says how many actions are given if, and only if, the model asks.
+
+    Args:
+        prefix_conditioning: of the model: it is trained to continue a chunk.
+        prefix_len: ``(B, K)`` int64 of the batch, or None.
+
+    Raises:
+        ConfigError: one without the other.
+    """
+    if prefix_conditioning != (prefix_len is not None):
+        raise ConfigError(
+            f"prefix_conditioning is {prefix_conditioning}, and the batch has "
+            f"{'no' if prefix_len is None else 'a'} prefix_len",
+            next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
+            "prefix_len among the collator's keys, belong to prefix_conditioning=True",
         )

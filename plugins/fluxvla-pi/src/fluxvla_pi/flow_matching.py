@@ -18,7 +18,7 @@ import torch
 from fluxvla_models.folded_attention import folded_mask
 from fluxvla_models.guidance import Guide
 from fluxvla_models.velocity import sample
-from fluxvla_models.widths import check_actions
+from fluxvla_models.widths import check_actions, check_prefix_len
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
@@ -210,13 +210,7 @@ class PiFlowMatching(VLA, nn.Module):
                 ``prefix_conditioning`` or the reverse.
         """
         self._check(actions, "actions")
-        if self.prefix_conditioning != (prefix_len is not None):
-            raise ConfigError(
-                f"prefix_conditioning is {self.prefix_conditioning}, and the batch has "
-                f"{'no' if prefix_len is None else 'a'} prefix_len",
-                next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
-                "prefix_len among the collator's keys, belong to prefix_conditioning=True",
-            )
+        check_prefix_len(self.prefix_conditioning, prefix_len)
         draws = noise.shape[1]
         tau = (1.0 - time).flatten()
         noise, clean = noise.flatten(0, 1), actions.repeat_interleave(draws, 0)

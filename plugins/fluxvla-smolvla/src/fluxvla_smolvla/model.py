@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from fluxvla_models.guidance import Guide
 from fluxvla_models.velocity import sample
-from fluxvla_models.widths import check_actions, check_states
+from fluxvla_models.widths import check_actions, check_prefix_len, check_states
 from torch import Tensor, nn
 
 from fluxvla_core.errors import ConfigError
@@ -199,13 +199,7 @@ class SmolVLA(VLA, nn.Module):
             ConfigError: an input of a width that the model does not have; ``prefix_len`` without
                 ``prefix_conditioning``, or the reverse.
         """
-        if self.prefix_conditioning != (prefix_len is not None):
-            raise ConfigError(
-                f"prefix_conditioning is {self.prefix_conditioning}, and the batch has "
-                f"{'no' if prefix_len is None else 'a'} prefix_len",
-                next="dict(type='SamplePrefixLength', max_delay=...) behind SampleFlowNoise, and "
-                "prefix_len among the collator's keys, belong to prefix_conditioning=True",
-            )
+        check_prefix_len(self.prefix_conditioning, prefix_len)
         repeats = noise.shape[1]
         check_actions("SmolVLA", tuple(actions.shape[1:]), self.action_shape)
         check_actions("SmolVLA", tuple(noise.shape[2:]), self.action_shape, "noise")

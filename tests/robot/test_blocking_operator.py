@@ -84,7 +84,13 @@ def test_a_get_frame_that_returns_late_says_which_stream_came_last(bench, make_a
 def test_a_process_that_stood_still_blames_neither_the_policy_nor_a_stream(bench, make_arm):
     """Native code that sleeps without giving up the interpreter: nothing else runs meanwhile."""
     bench.arm = make_arm(realtime=True)
-    bench.policy.faults[4] = lambda chunk: stand_still(0.8)
+
+    def still(chunk):
+        stand_still(0.8)
+        time.sleep(0.5)  # the loop sees it before the chunk arrives, whichever thread runs first
+        return chunk
+
+    bench.policy.faults[4] = still
 
     fails(
         bench,

@@ -64,6 +64,9 @@ inference = dict(
     seed=500,
     task_descriptions={"1": "pick up the red cube"},
     execute_horizon=5,
+    # A robot does not wait for the policy: chunks played one after the other would each begin late,
+    # and an episode would end before the lift.
+    chunk_joining="overlap",
     max_publish_step=300,
     # Other URs, real ones too, take the same values under another ``type``. UROperator sends 125
     # commands a second, so that an episode needs a larger max_publish_step (ur5e_sim_ros2.py).

@@ -27,10 +27,12 @@ NEED_MORE = (
     "tests/data/test_collator.py",
     "tests/data/test_dataset.py",
     "tests/data/test_decoder_threads.py",
+    "tests/data/test_earlier_observations.py",
     "tests/data/test_inference_dataset.py",
     "tests/data/test_lerobot_oracle.py",
     "tests/data/test_loader.py",
     "tests/data/test_mixture.py",
+    "tests/data/test_preparation.py",
     "tests/data/transforms/test_deferral.py",
     "tests/data/transforms/test_pipeline.py",
     "tests/data/test_tokenizer.py",  # tokenizers, and a package with one

@@ -113,12 +113,13 @@ def _train(plan: Plan, runner: Any, context: Any) -> tuple[Any, int]:
     from fluxvla_core.errors import located
     from fluxvla_core.training.base_runner import BaseTrainRunner
     from fluxvla_core.training.fit_checks import check_data
-    from fluxvla_core.training.validation import validation_dataset
 
     with located(context.where("train_dataloader.dataset")):
         dataset = build_dataset_from_cfg(context.config["train_dataloader"]["dataset"], context)
     if isinstance(runner, BaseTrainRunner):  # another's collator may not be an attribute
         if runner.val_options is not None:
+            from fluxvla_core.training.validation import validation_dataset  # imports torch
+
             runner.val_dataset = validation_dataset(context, dataset, runner.options.seed)
         check_data(context, dataset, runner.collator, runner.val_dataset)
     try:

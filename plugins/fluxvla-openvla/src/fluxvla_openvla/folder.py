@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from fluxvla_core.errors import CheckpointError
-from fluxvla_core.models import check_settings
 from fluxvla_core.results import read_json
 
 SIDECAR = "fluxvla_openvla.json"
@@ -223,6 +222,8 @@ def check_config(config: Mapping[str, Any], folder: Path) -> None:
     Raises:
         CheckpointError: with what the config says.
     """
+    from fluxvla_core.models import check_settings  # imports torch
+
     where = str(folder / "config.json")
     if not is_native(folder, config):
         check_settings(config, _SETTINGS, where)

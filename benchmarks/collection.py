@@ -153,9 +153,9 @@ def main() -> int:
     summary = {
         **begun,
         "rounds": args.rounds,
-        "picture_ms": {n: round(middle(d[n][0] for d in drawn), 1) for n in sides},
-        "picture_cpu_ms": {n: round(middle(d[n][1] for d in drawn), 1) for n in sides},
-        "cheap_pictures_times_faster": round(
+        "image_ms": {n: round(middle(d[n][0] for d in drawn), 1) for n in sides},
+        "image_cpu_ms": {n: round(middle(d[n][1] for d in drawn), 1) for n in sides},
+        "cheap_images_times_faster": round(
             middle(d["reference"][1] / d["cheap"][1] for d in drawn), 1
         ),
         "collection_steps_per_s": {n: round(middle(s[n] for s in speed)) for n in (1, 2)},

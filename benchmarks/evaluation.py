@@ -38,13 +38,13 @@ SIDE = Path(__file__).with_name("_evaluation_side.py")
 EPISODE = 300
 NEEDS = ("gym-aloha==0.1.5", "mujoco==3.3.0")
 """The simulator, in addition to what LeRobot itself imports."""
-KEYS = {"engine, stock pictures": "times_lerobot", "engine": "times_lerobot_cheap_pictures"}
+KEYS = {"engine, stock images": "times_lerobot", "engine": "times_lerobot_cheap_images"}
 GOALS = {"times_lerobot": 1.5, "share_of_bare": 0.9}
 # side -> words of _evaluation_side.py: side, steps, episodes for each process, images
 SIDES = {
     "lerobot": ("lerobot", 20, 1, "reference"),
-    "gymnasium.vector, stock pictures": ("vector", 20, 2, "reference"),
-    "engine, stock pictures": ("engine", 20, 2, "reference"),
+    "gymnasium.vector, stock images": ("vector", 20, 2, "reference"),
+    "engine, stock images": ("engine", 20, 2, "reference"),
     "engine": ("engine", 100, 2, "cheap"),
     "bare": ("bare", 100, 2, "cheap"),
 }
@@ -122,7 +122,7 @@ def main() -> int:
         "share_of_bare": round(statistics.median(shares), 3),
         "share_of_bare_by_cpu": round(cost["bare"] / cost["engine"], 3),
     }
-    own, theirs = "engine, stock pictures", "gymnasium.vector, stock pictures"
+    own, theirs = "engine, stock images", "gymnasium.vector, stock images"
     figures["times_gymnasium_vector"] = round(pace[own] / pace[theirs], 2)
     figures["times_gymnasium_vector_by_cpu"] = round(cost[theirs] / cost[own], 2)
     if "lerobot" in runs:

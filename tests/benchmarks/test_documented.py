@@ -34,9 +34,9 @@ def rows(name: str, head: str) -> list[list[str]]:
 
 
 SIDES = {
-    "the engine, stock images": "engine, stock pictures",
+    "the engine, stock images": "engine, stock images",
     "`gymnasium.vector` (asynchronous) around the same scene, stock images": (
-        "gymnasium.vector, stock pictures"
+        "gymnasium.vector, stock images"
     ),
     "`lerobot-eval`'s rollout, stock images": "lerobot",
     "the engine, cheap images (the default)": "engine",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,17 @@ def test_training(run: Fluxvla) -> None:
         "steps: 2",
         "work dir: work_dirs/c",
     ]
+
+
+def test_a_train_runner_of_ones_own_needs_no_torch(write: Write) -> None:
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from fluxvla_core.cli.main import main\n"
+        "words = 'run --plugin toy.py --config c.py --section runner'\n"
+        "sys.exit(main(words.split()))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert said()["examples"] == 3
 
 
 def test_a_hint_names_the_tables_of_the_config(run: Fluxvla) -> None:

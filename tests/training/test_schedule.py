@@ -106,7 +106,6 @@ def test_the_scheduler_goes_on_from_its_step_alone(kind):
     scheduler.load_state_dict(state)
     for step in range(7, 20):
         assert optimizer.param_groups[0]["lr"] == seen[step]
-        assert scheduler.get_last_lr() == [seen[step]]
         optimizer.step()
         scheduler.step()
 

@@ -72,7 +72,6 @@ class Found:
     registry: str
     name: str
     origin: str
-    plugin: Plugin | None
     signature: Signature | None
 
     @property
@@ -102,7 +101,7 @@ def resolve(name: str, registry: str | None = None) -> Found:
         from fluxvla_core.config.runtime_signature import inspect_signature
 
         signature = inspect_signature(here)
-        return Found(registry, name, "registered in this process", None, signature)
+        return Found(registry, name, "registered in this process", signature)
     plugin = find(PREFIX + registry, name, tuple(BY_NAME[registry]))
     return installed(plugin)
 
@@ -149,7 +148,7 @@ def installed(plugin: Plugin) -> Found:
             )
     elif signature.api is not None:
         check_api(registry, signature.name, signature.api, plugin.origin)
-    return Found(registry, plugin.name, plugin.origin, plugin, signature)
+    return Found(registry, plugin.name, plugin.origin, signature)
 
 
 def _only_registry(name: str) -> str:

@@ -87,7 +87,7 @@ def _classes(registry: str) -> Iterable[_Class]:
     registered = [name for name in group if group.registered(name) is not None]
     for name in registered:
         signature = inspect_signature(group.registered(name))
-        resolved = Found(registry, name, "registered in this process", None, signature)
+        resolved = Found(registry, name, "registered in this process", signature)
         yield _Class((name,), resolved)
     for name, plugins in sorted(group.installed().items()):
         preferred = [p for p in plugins if is_core(p)] or (plugins if len(plugins) == 1 else [])

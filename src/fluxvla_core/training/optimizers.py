@@ -178,10 +178,6 @@ class ScheduledLR:
         self.last_epoch += 1
         self._set_rates()
 
-    def get_last_lr(self) -> list[float]:
-        """The rate of each group."""
-        return [group["lr"] for group in self.optimizer.param_groups]
-
     def state_dict(self) -> dict[str, Any]:
         """The step."""
         return {"step": self.last_epoch}

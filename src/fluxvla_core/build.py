@@ -8,7 +8,7 @@ FluxVLA's classes do. So a class can supply defaults for its children.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -154,18 +154,24 @@ def takes(cfg: Any, registry: Registry, name: str) -> bool:
 def parameters(cls: type) -> set[str]:
     """Names that a constructor takes, following ``**kwargs`` into its base classes and Options."""
     names: set[str] = set()
+    for found in constructors(cls):
+        names |= {n for n, p in found.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+        kwargs = [n for n, p in found.items() if p.kind is p.VAR_KEYWORD]
+        if kwargs == [OPTIONS_KEYWORDS]:
+            names |= option_names(cls)
+    return names - {"self"}
+
+
+def constructors(cls: type) -> Iterator[Mapping[str, inspect.Parameter]]:
+    """Parameters of the constructors that ``cls(**kwargs)`` reaches, the class's own first."""
     for base in inspect.getmro(cls):
         init = base.__dict__.get("__init__")
         if init is None or base is object:
             continue
         found = inspect.signature(init).parameters
-        names |= {n for n, p in found.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
-        kwargs = [n for n, p in found.items() if p.kind is p.VAR_KEYWORD]
-        if kwargs == [OPTIONS_KEYWORDS]:
-            names |= option_names(cls)
-        if not kwargs:
-            break
-    return names - {"self"}
+        yield found
+        if not any(p.kind is p.VAR_KEYWORD for p in found.values()):
+            return
 
 
 def _explained(cls: type, cfg: Mapping[str, Any], context: RunContext | None) -> ConfigError | None:

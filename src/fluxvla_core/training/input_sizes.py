@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fluxvla_core.build import class_of
+from fluxvla_core.build import class_of, constructors
 from fluxvla_core.config.resolve import SLOTS
 from fluxvla_core.contracts.training import InputSizes, Size
 from fluxvla_core.errors import FluxError
@@ -155,16 +155,10 @@ def _argument(cls: type, table: Mapping[str, Any], name: str) -> Any:
 
 def _default(cls: type, name: str) -> Any:
     """The default of a constructor's argument, following ``**kwargs`` into base classes."""
-    for base in inspect.getmro(cls):
-        init = base.__dict__.get("__init__")
-        if init is None or base is object:
-            continue
-        found = inspect.signature(init).parameters
+    for found in constructors(cls):
         if name in found:
             default = found[name].default
             return None if default is inspect.Parameter.empty else default
-        if not any(p.kind is p.VAR_KEYWORD for p in found.values()):
-            break
     return None
 
 

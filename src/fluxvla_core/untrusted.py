@@ -51,13 +51,13 @@ def read_bytes(path: Path, error: type[FluxError], *, at_most: int = AT_MOST) ->
     return content
 
 
-def read_json(path: Path, kind: type[T], error: type[FluxError], *, at_most: int = AT_MOST) -> T:
+def read_json(path: Path, kind: type[T], error: type[FluxError]) -> T:
     """The JSON in a file, as a ``kind``; see ``parse_json``.
 
     Raises:
         error: see ``read_bytes`` and ``parse_json``.
     """
-    return parse_json(read_bytes(path, error, at_most=at_most), kind, error, str(path))
+    return parse_json(read_bytes(path, error), kind, error, str(path))
 
 
 def parse_json(content: bytes | str, kind: type[T], error: type[FluxError], where: str) -> T:

@@ -20,6 +20,7 @@ read an embodiment use these functions too.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -369,24 +370,22 @@ def name_best(work_dir: Path, step: int) -> bool:
     return True
 
 
-def set_aside_later(work_dir: Path, step: int, disk: Disk | None = None) -> list[Path]:
+def set_aside_later(work_dir: Path, step: int) -> list[Path]:
     """Rename checkpoints of steps after ``step``, which a run resumed there no longer continues.
 
     Left in place they would be taken for the newest and be kept instead of the resumed run's.
     """
-    disk = disk or Disk()
     moved = []
     for folder in folders(work_dir):
         if (step_of(folder) or 0) > step:
             target = free_name(folder)
-            disk.rename(folder, target)
+            os.rename(folder, target)
             moved.append(target)
     return moved
 
 
-def clear_leftovers(work_dir: Path, disk: Disk | None = None) -> None:
+def clear_leftovers(work_dir: Path) -> None:
     """Remove what killed saves and rotations left: half-written and half-removed folders."""
-    disk = disk or Disk()
     for path in sorted((work_dir / FOLDER).glob("step-*")):
         if path.name.endswith((PARTIAL, REMOVING)) and path.is_dir():
-            disk.remove_folder(path)
+            shutil.rmtree(path)

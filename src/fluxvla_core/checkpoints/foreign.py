@@ -355,7 +355,7 @@ def _other_numbers(table: Any, model: object) -> list[tuple[str, int, int]]:
 
 
 def unknown_format(
-    name: str, known: Sequence[CheckpointFormat], failed: Sequence[PluginError] = ()
+    name: str, known: Sequence[CheckpointFormat], failed: Sequence[PluginError]
 ) -> str:
     """Says that no format is called ``name``, what there is, and what cannot be loaded."""
     names = sorted({f.name for f in known})

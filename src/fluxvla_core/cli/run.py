@@ -255,7 +255,7 @@ def _plan_evaluation(args: argparse.Namespace, plan: Plan) -> list[str]:
     return [*argv, "--work-dir", str(plan.work_dir), *_repeated(args)]
 
 
-def _evaluate(argv: list[str], late: int = 0) -> None:
+def _evaluate(argv: list[str], late: int) -> None:
     """Become the process that evaluates: it keeps this one's id, terminal and signals.
 
     Args:

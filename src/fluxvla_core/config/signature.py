@@ -179,7 +179,7 @@ def implements(plugin: Plugin, contract: str, method: str) -> bool | None:
 
 
 def combine(
-    inits: Iterable[Init], unknown: bool = False, options: Sequence[Parameter] | None = None
+    inits: Iterable[Init], unknown: bool, options: Sequence[Parameter] | None
 ) -> tuple[tuple[Parameter, ...], bool]:
     """The parameters that reach some ``__init__`` of the chain, and whether others may.
 

@@ -93,7 +93,7 @@ def assumed_example(
     table: Mapping[str, Any],
     robot: EmbodimentSpec | None,
     widths: tuple[int, int],
-    notes: Sequence[str] = (),
+    notes: Sequence[str],
 ) -> Example:
     """A sample of zeros by a dataset's ``table`` alone; see :func:`example`."""
     states, actions = widths if robot is None else (robot.state_dim, robot.dim)

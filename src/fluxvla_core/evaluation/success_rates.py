@@ -28,6 +28,10 @@ from fluxvla_core.errors import UsageError
 from fluxvla_core.evaluation.episodes import DONE, POLICY, SWAPPED
 
 CONFIDENCE = 0.95
+LEVEL = 0.05
+"""Significance level of the tests."""
+POWER = 0.8
+"""How often ``smallest_difference`` would have been shown."""
 
 Records = Sequence[Mapping[str, Any]]
 
@@ -198,21 +202,17 @@ def one_sided_p(for_it: int, against: int) -> float:
     return float(tail / 2**tosses)
 
 
-def smallest_difference(pairs: int, level: float = 0.05, power: float = 0.8) -> float | None:
+def smallest_difference(pairs: int) -> float | None:
     """The smallest difference of two success rates that so many pairs could have shown.
 
     At best: where all pairs that differ favour one side. The two-sided test then rejects from ``k``
-    of them on, ``k`` the least with ``2 / 2**k <= level``; the power is the binomial probability of
-    ``k`` or more among ``pairs``, each with the difference as its probability.
-
-    Args:
-        level: significance level of the test.
-        power: how often such a difference would have been shown.
+    of them on, ``k`` the least with ``2 / 2**k <= LEVEL``; the power is the binomial probability of
+    ``k`` or more among ``pairs``, each with the difference as its probability, and is ``POWER``.
 
     Returns:
         In 0..1; None where even a difference of 1 could not be shown.
     """
-    least = next(k for k in range(1, 64) if 2 * one_sided_p(k, 0) <= level)
+    least = next(k for k in range(1, 64) if 2 * one_sided_p(k, 0) <= LEVEL)
     if pairs < least:
         return None
 
@@ -225,13 +225,13 @@ def smallest_difference(pairs: int, level: float = 0.05, power: float = 0.8) -> 
     low, high = 0.0, 1.0
     while high - low > 1e-6:
         middle = (low + high) / 2
-        low, high = (low, middle) if shown(middle) >= power else (middle, high)
+        low, high = (low, middle) if shown(middle) >= POWER else (middle, high)
     return high
 
 
-def verdict(comparison: Mapping[str, Any], level: float = 0.05) -> str:
+def verdict(comparison: Mapping[str, Any]) -> str:
     """A test's result, as :meth:`Comparison.to_dict` gives it, in words."""
-    if comparison["p_different"] <= level:
+    if comparison["p_different"] <= LEVEL:
         return "a difference"
     least, pairs = comparison["smallest_difference"], comparison["pairs"]
     many = "1 pair" if pairs == 1 else f"{pairs} pairs"

@@ -287,7 +287,7 @@ class Parts:
         return {name: value for name, value in batch.items() if name in self.names}
 
 
-def execution_of(name: str, model: Any, compiled: bool = False) -> Eager:
+def execution_of(name: str, model: Any, compiled: bool) -> Eager:
     """The way ``name`` of :data:`EXECUTIONS` for ``model``.
 
     All but ``eager`` compile its blocks by ``torch.compile``, for the shapes that they meet.

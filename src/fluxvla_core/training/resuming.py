@@ -47,7 +47,7 @@ AUTO = "auto"
 
 
 def choose_checkpoint(
-    world: World, context: RunContext, resume: str | None, first: str | None = None
+    world: World, context: RunContext, resume: str | None, first: str | None
 ) -> Checkpoint | None:
     """The verified checkpoint to resume from, None to start from scratch; the same on every rank.
 

@@ -62,7 +62,7 @@ def save_snapshot(
     epoch: int,
     snapshot: Snapshot,
     keep: int,
-    spare: int | None = None,
+    spare: int | None,
 ) -> Path:
     """Begin the checkpoint of ``step``; ``saver.finish_pending`` says when it is complete.
 

@@ -6,6 +6,8 @@ import importlib
 import inspect
 import pkgutil
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -98,6 +100,17 @@ def test_every_class_of_the_repository_is_in_the_reference() -> None:
     assert [n for n in named if f"## {n} {{ #{n} }}" not in text] == []
     # Its keys are read from source: a class whose source cannot be read would have none.
     assert "- `max_keep_ckpts" in text
+
+
+def test_commands_describe_themselves_without_torch() -> None:
+    """As the site is built, in an environment that has the core's dependencies alone."""
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from pathlib import Path\n"
+        "from tools.docs import commands\n"
+        "commands.render(Path())"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
 def test_every_command_is_in_the_reference() -> None:

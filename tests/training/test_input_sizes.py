@@ -34,6 +34,7 @@ class BaseSized(VLA, torch.nn.Module):
         horizon="vla_head.horizon",
         n_obs_steps="n_obs",
         embodiments=3,
+        vocabulary=50,
         float_images=True,
     )
 
@@ -96,6 +97,7 @@ def test_sizes_are_arguments_their_defaults_those_of_parts_and_of_base_classes()
         "horizon": Declared("vla_head.horizon", 8),
         "n_obs_steps": Declared("n_obs", 1),
         "embodiments": Declared("", 3),
+        "vocabulary": Declared("", 50),
         "float_images": Declared("", True),
     }
     assert chunk_of(found) == (8, 7)
@@ -143,6 +145,11 @@ def test_what_fits_is_no_misfit():
         ({"actions": [np.zeros((8, 4))]}, "action_dim", "is 7, in the data it is 4"),
         ({"embodiment_ids": torch.tensor([3])}, "", "are below 3, in the data one is 3"),
         ({"embodiment_ids": torch.tensor([-1])}, "", "are below 3, in the data one is -1"),
+        (
+            {"lang_tokens": torch.tensor([[7, 50, 8]])},
+            "",
+            "ids of tokens are below 50, in the data they go up to 50",
+        ),
     ],
 )
 def test_a_misfit_names_the_key_and_both_values(change, key, words):
@@ -150,6 +157,13 @@ def test_a_misfit_names_the_key_and_both_values(change, key, words):
     assert found.key == key
     assert found.text.startswith("Sized: ")
     assert words in found.text
+
+
+def test_words_that_the_batch_does_not_have_count_too():
+    shown = batch(lang_tokens=torch.tensor([[7, 49, 8]]))
+    assert misfits(TABLE, shown, tokens=50) == []
+    (found,) = misfits(TABLE, shown, tokens=51)
+    assert found.text == "Sized: ids of tokens are below 50, in the data they go up to 50"
 
 
 class Data:

@@ -49,6 +49,7 @@ class PretrainedTokenizer(Tokenizer):
         self._tokenizer.no_padding()
         self._tokenizer.no_truncation()
         self.pad_token_id = self._find_pad()
+        self.base_vocab_size = int(self._tokenizer.get_vocab_size(with_added_tokens=False))
 
     @property
     def vocab_size(self) -> int:

@@ -32,6 +32,7 @@ _ADVICE = {
     "image_size": "let a transform resize images",
     "states": _PADDED,
     "actions": _PADDED,
+    "vocabulary": "let the transforms' tokenizer be the one of the model",
     "horizon": "the chunk is as long as action_window_size of the dataset",
     "embodiments": "embodiment_id of the dataset is the robot's number",
     "float_images": "let a transform normalise images",
@@ -86,6 +87,7 @@ def misfits(
     batch: Mapping[str, Any],
     sizes: Mapping[str, Declared] | None = None,
     data: str = "the data",
+    tokens: int = 0,
 ) -> list[Misfit]:
     """Where ``batch`` has other sizes than the model of ``table`` takes.
 
@@ -94,18 +96,22 @@ def misfits(
             an entry for each sample. What it does not have is not compared.
         sizes: those of ``table``, if they are known.
         data: where the batch is from, for the text.
+        tokens: number of ids that its tokenizer has, see ``token_count``: another instruction than
+            that of ``batch`` may have any of them.
     """
     sizes = declared_sizes(table) if sizes is None else sizes
     if not sizes:
         return []
     who = getattr(class_of(table["type"], VLAS), "__name__", str(table["type"]))
     found = []
-    for size, have in _sizes_of(batch).items():
+    for size, have in _sizes_of(batch, tokens).items():
         one = sizes.get(size)
         if one is None or _fits(size, one.value, have):
             continue
         if size == "embodiments":
             text = f"embodiment_ids are below {one.value}, in {data} one is {have}"
+        elif size == "vocabulary":
+            text = f"ids of tokens are below {one.value}, in {data} they go up to {have}"
         elif size == "float_images":
             text = f"images are normalised floats, in {data} they are {have}"
         else:
@@ -168,7 +174,19 @@ def _default(cls: type, name: str) -> Any:
     return None
 
 
-def _sizes_of(batch: Mapping[str, Any]) -> dict[str, Any]:
+def largest_token(batch: Mapping[str, Any]) -> int:
+    """The largest id of a batch's ``lang_tokens``; -1 without any."""
+    tokens = batch.get("lang_tokens")
+    return -1 if tokens is None or not np.size(tokens) else int(np.max(np.asarray(tokens)))
+
+
+def token_count(pipeline: Any) -> int:
+    """Ids, without added tokens, that the tokenizers of a ``Pipeline`` have; 0 if unknown."""
+    tokenizers = (getattr(t, "tokenizer", None) for t in getattr(pipeline, "transforms", ()))
+    return max((getattr(t, "base_vocab_size", None) or 0 for t in tokenizers), default=0)
+
+
+def _sizes_of(batch: Mapping[str, Any], tokens: int) -> dict[str, Any]:
     """The sizes that a batch has, by the fields of ``InputSizes``."""
     found: dict[str, Any] = {}
     images, states, actions = (_shape(batch.get(key)) for key in ("images", "states", "actions"))
@@ -183,6 +201,9 @@ def _sizes_of(batch: Mapping[str, Any]) -> dict[str, Any]:
     ids = batch.get("embodiment_ids")
     if ids is not None and np.size(ids):
         found["embodiments"] = int(np.max(np.asarray(ids)))
+    highest = max(largest_token(batch), tokens - 1)
+    if highest >= 0:
+        found["vocabulary"] = highest
     return found
 
 
@@ -194,7 +215,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 
 def _fits(size: str, takes: Any, has: Any) -> bool:
-    if size == "embodiments":
+    if size in ("embodiments", "vocabulary"):
         return 0 <= int(has) < int(takes)
     if size == "float_images":
         return "float" in has or not has

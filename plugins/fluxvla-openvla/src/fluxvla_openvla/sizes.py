@@ -94,3 +94,8 @@ def read_size(table: Mapping[str, Any] | Size | None, default: Size, where: str)
             raise ConfigError(f"{where}.{key} must be of type {kind.__name__}, got {value!r}")
         values[key] = kind(value)
     return type(default)(**values)
+
+
+def vocabulary(language: Mapping[str, Any] | LanguageSize | None) -> int:
+    """Tokens that a language model of this size embeds."""
+    return read_size(language, LanguageSize(), "language").vocab_size

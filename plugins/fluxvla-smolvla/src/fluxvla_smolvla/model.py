@@ -106,6 +106,7 @@ class SmolVLA(VLA, nn.Module):
         states="max_state_dim",
         actions="max_action_dim",
         horizon="n_action_steps",
+        vocabulary=("text", lambda text: size_of(TextSize, text).vocabulary),
         float_images=True,
     )
 

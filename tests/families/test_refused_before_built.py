@@ -126,7 +126,7 @@ TOKENIZERS = [
     ("openvla_oft", "model.language: OpenVLAOFT: ", (416, 2002)),
     ("llava", "model.llm_backbone.sizes: LlavaVLA: ", (264, 2257)),
 ]
-"""The largest id is that of the last word, or of a mark behind the words: an image's, or padding."""
+"""The largest id is that of the last word, or of a mark behind it: an image's, or padding."""
 
 
 @pytest.mark.parametrize(("family", "key", "ids"), TOKENIZERS)

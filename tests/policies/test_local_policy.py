@@ -490,7 +490,7 @@ def test_an_instruction_with_a_token_that_the_model_does_not_embed(reading):
     said = f"the instruction 'wave at <loc>' has the token 30; the policy of {place} knows those"
     with pytest.raises(ConfigError, match=re.escape(f"{said} below 30")) as error:
         policy.predict_action(typed)
-    assert error.value.next == "use other words"
+    assert error.value.next == "use other words, or name the model's own tokenizer"
     assert policy.predict_action(observation()).shape == (4, 2)
 
 

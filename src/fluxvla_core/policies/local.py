@@ -292,7 +292,7 @@ class LocalPolicy(Policy):
             raise ConfigError(
                 f"the instruction {quoted(str(said))} has the token {token}; the policy of "
                 f"{self.source or 'this model'} knows those below {self._vocabulary}",
-                cause="the tokenizer is not the model's, or has added tokens that the model does not",
+                cause="the tokenizer is not the model's, or has added tokens that the model lacks",
                 next="use other words, or name the model's own tokenizer",
             )
         several = [key for key in ("images", "states") if history and key in present]

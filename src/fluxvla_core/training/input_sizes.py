@@ -15,7 +15,8 @@ import numpy as np
 
 from fluxvla_core.build import class_of
 from fluxvla_core.config.resolve import SLOTS
-from fluxvla_core.contracts.training import InputSizes, Size
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import InputSizes, Size, Tokenizer
 from fluxvla_core.errors import FluxError
 from fluxvla_core.plugins.registry import BY_NAME, VLAS
 
@@ -182,8 +183,9 @@ def largest_token(batch: Mapping[str, Any]) -> int:
 
 def token_count(pipeline: Any) -> int:
     """Ids, without added tokens, that the tokenizers of a ``Pipeline`` have; 0 if unknown."""
-    tokenizers = (getattr(t, "tokenizer", None) for t in getattr(pipeline, "transforms", ()))
-    return max((getattr(t, "base_vocab_size", None) or 0 for t in tokenizers), default=0)
+    found = (getattr(t, "tokenizer", None) for t in getattr(pipeline, "transforms", ()))
+    tokenizers = (Tokenizer.adapt(t) for t in found if implements(t, Tokenizer, "encode"))
+    return max((t.base_vocab_size or 0 for t in tokenizers), default=0)
 
 
 def _sizes_of(batch: Mapping[str, Any], tokens: int) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -198,6 +199,33 @@ def test_the_first_sample_of_every_dataset_is_compared():
         with pytest.raises(ConfigError, match=wrong) as error:
             check_data(context(), data, stack)
         assert "or those that a transform pads them to" in str(error.value)
+
+
+class Words:
+    """A tokenizer of so many words."""
+
+    def __init__(self, count):
+        self.base_vocab_size = count
+
+    def encode(self, text):
+        return [0]
+
+
+@pytest.mark.parametrize("tokenizer", [None, object(), Words(50), Words(None)])
+def test_a_tokenizer_that_fits_or_does_not_say_how_many_words_it_has(tokenizer):
+    data = Data()
+    data.pipeline = SimpleNamespace(transforms=[SimpleNamespace(tokenizer=tokenizer)])
+    check_data(context(), data, stack)
+
+
+def test_the_tokenizer_of_every_dataset_is_compared():
+    other = Data()
+    other.pipeline = SimpleNamespace(transforms=[SimpleNamespace(tokenizer=Words(60))])
+    wrong = "a.py:3: model: Sized: ids of tokens are below 50, in the data they go up to 59"
+    for data in (other, Data(datasets=[Data(), other])):
+        with pytest.raises(ConfigError, match=wrong) as error:
+            check_data(context(), data, stack)
+        assert "let the transforms' tokenizer be the one of the model" in error.value.next
 
 
 def test_a_dataset_need_not_keep_its_frames_in_memory_for_it():

@@ -133,6 +133,20 @@ def test_in_real_time_the_policy_is_told_what_is_executed_meanwhile(bench, make_
 
 
 @pytest.mark.realtime
+def test_a_robot_that_waits_for_its_policy_says_how_it_need_not(bench, make_arm, going):
+    going.slow_s = 0.15
+    waited = {}
+    for method in ("synchronous", "overlap"):
+        bench.arm, bench.notes.lines = make_arm(realtime=True), []
+        bench.run(chunk_joining=method, max_publish_step=75)
+        waited[method] = [line for line in bench.notes.lines if "waited for the policy" in line]
+
+    (line,) = waited["synchronous"]
+    assert "% of the control periods; chunk_joining = 'overlap'" in line
+    assert waited["overlap"] == []
+
+
+@pytest.mark.realtime
 def test_the_target_has_no_seam_where_a_policy_keeps_to_what_is_frozen(bench, make_arm, going):
     """The same slow policy, with and without real-time chunking, on an arm that lags behind."""
     going.slow_s = 0.15

@@ -62,6 +62,8 @@ from fluxvla_core.spec import EmbodimentSpec
 
 Array = npt.NDArray[np.float64]
 FOLDER = "inference"
+_WAITED = 0.05
+"""A run says so if the robot waits for its policy in a larger share of the control periods."""
 
 
 class BaseInferenceRunner(Runner):
@@ -112,6 +114,7 @@ class BaseInferenceRunner(Runner):
         self.recorder: EpisodeRecorder | None = None
         """The recorder of the last episode."""
         self._history = RunHistory()
+        self._waiting_reported = False
 
     def _choose_layout(self, context: RunContext | None) -> ProcessLayout:
         """Choose which process commands the robot, and build this process's operator."""
@@ -306,7 +309,18 @@ class BaseInferenceRunner(Runner):
         observers = (self.recorder, *self._observers)
         self._engine.run_episode(task, number, self.seed + number, observers, self.recorder.folder)
         self._history.episodes += 1
+        self._report_waiting(self.recorder.summary)
         return self.recorder.summary
+
+    def _report_waiting(self, summary: Mapping[str, Any]) -> None:
+        """Say, once, that the robot need not wait for its policy, if it often did."""
+        waited = summary["held_ticks"] / max(summary["steps"], 1)
+        if waited > _WAITED and not self._waiting_reported and not self._joiner().streamed:
+            self._waiting_reported = True
+            self.context.reporter.info(
+                f"the robot waited for the policy in {waited:.0%} of the control periods; "
+                "chunk_joining = 'overlap' queries the policy while the robot moves"
+            )
 
     def _make_engine(self, interrupts: Interrupts, thread: PolicyThread) -> Engine:
         """The engine of one run: ``RemoteEngine`` with a control process, else ``LocalEngine``.

@@ -119,12 +119,12 @@ TOKENIZERS = [
     ("pi0", "model.vocab_size: PI0FlowMatching: ", (264, 2257)),
     ("pi05", "model.vocab_size: PI05FlowMatching: ", (264, 2257)),
     ("pi0_fast", "model.vocab_size: PI0FAST: ", (1024, 2257)),
-    ("smolvla", "model.text: SmolVLA: ", (264, 2257)),
+    ("smolvla", "model.text.vocabulary: SmolVLA: ", (264, 2257)),
     ("gr00t_n15", "model.vlm_backbone.vocabulary: GR00T: ", (264, 2260)),
     ("gr00t_n17", "model.vlm_backbone.vocabulary: GR00T: ", (264, 2263)),
-    ("openvla", "model.language: OpenVLA: ", (416, 2002)),
-    ("openvla_oft", "model.language: OpenVLAOFT: ", (416, 2002)),
-    ("llava", "model.llm_backbone.sizes: LlavaVLA: ", (264, 2257)),
+    ("openvla", "model.language.vocab_size: OpenVLA: ", (416, 2002)),
+    ("openvla_oft", "model.language.vocab_size: OpenVLAOFT: ", (416, 2002)),
+    ("llava", "model.llm_backbone.sizes.vocab_size: LlavaVLA: ", (264, 2257)),
 ]
 """The largest id is that of the last word, or of a mark behind it: an image's, or padding."""
 

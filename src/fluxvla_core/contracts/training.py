@@ -45,7 +45,7 @@ class InputSizes:
     """Sizes of the batches that a model takes, as arguments of its constructor say them.
 
     Data, robots and checkpoints are compared with them before a model is built. Each is the name of
-    an argument (``vla_head.horizon``: of the table ``vla_head``; ``a | b``: of the one that is
+    an argument (``vla_head.horizon``: of the table ``vla_head``; ``a | b``: of the first that is
     set), a number or two, or such a name and a function of the value. None is any size, also as a
     value.
 

@@ -149,13 +149,18 @@ def _read(cls: type, table: Mapping[str, Any], stated: Size) -> Declared | None:
 
 
 def _argument(cls: type, table: Mapping[str, Any], name: str) -> Any:
-    """The value of an argument, ``part.argument`` of a part's table, or its default."""
+    """The value of an argument or its default, ``part.argument`` or ``table.key`` of a table's."""
     first, _, rest = name.partition(".")
     value = table[first] if first in table else _default(cls, first)
     if not rest or value is None:
         return value
     if not isinstance(value, Mapping):
         return getattr(value, rest, None)  # a part that is built already
+    if first not in SLOTS:  # a table of sizes
+        found: Any = value
+        for key in rest.split("."):
+            found = found.get(key)
+        return found
     inner = class_of(value.get("type"), BY_NAME[SLOTS[first]])
     return _argument(inner, value, rest)
 

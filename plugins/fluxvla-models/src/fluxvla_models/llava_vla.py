@@ -29,12 +29,6 @@ def _image_size(sizes: Mapping[str, Any] | None) -> int | None:
     return vision.get("image_size")
 
 
-def _vocabulary(sizes: Mapping[str, Any] | None) -> int | None:
-    """Of a language model's ``sizes``, or those of a model that has one."""
-    language = sizes.get("text_config", sizes) if sizes else {}
-    return language.get("vocab_size")
-
-
 class LlavaVLA(VLA, nn.Module):
     """Images and an instruction through a vision-language model, its hidden states to actions.
 
@@ -66,7 +60,7 @@ class LlavaVLA(VLA, nn.Module):
         states="vla_head.state_dim",
         actions="vla_head.action_dim",
         horizon="vla_head.horizon",
-        vocabulary=("llm_backbone.sizes | vlm_backbone.sizes", _vocabulary),
+        vocabulary="llm_backbone.sizes.vocab_size | vlm_backbone.sizes.text_config.vocab_size",
         float_images=True,
     )
 

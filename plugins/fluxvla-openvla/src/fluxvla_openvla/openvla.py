@@ -79,7 +79,7 @@ class OpenVLA(Prismatic):
         image_size="image_size",
         actions="action_dim",
         horizon=1,
-        vocabulary=("language", vocabulary),
+        vocabulary=("language.vocab_size | language", vocabulary),
         float_images=True,
     )
 

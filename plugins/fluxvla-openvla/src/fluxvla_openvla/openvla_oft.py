@@ -58,7 +58,7 @@ class OpenVLAOFT(Prismatic):
         states=("state_dim", lambda width: width or None),
         actions="action_dim",
         horizon="horizon",
-        vocabulary=("language", vocabulary),
+        vocabulary=("language.vocab_size | language", vocabulary),
         float_images=True,
     )
 

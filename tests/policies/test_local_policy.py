@@ -442,3 +442,61 @@ def test_who_drives_the_robot_can_refuse_before_the_model_is_built(tmp_path, siz
 
     with pytest.raises(SpecMismatch, match="another robot"):
         load(save(tmp_path, config={"model": sized}), check=check)
+
+
+class ReadingVLA(LittleVLA):
+    """Embeds 30 tokens, fewer than the tokenizer has with those that were added to it."""
+
+    input_sizes = InputSizes(vocabulary="words")
+
+    def __init__(self, words: int = 30) -> None:
+        super().__init__()
+
+    def predict_action(self, images: Any, states: Any, noise: Any, lang_tokens: Any) -> Any:
+        return super().predict_action(images, states, noise)
+
+
+@pytest.fixture
+def reading(tmp_path):
+    from tokenizers import Tokenizer, models, pre_tokenizers
+
+    words = ["<unk>", "wave", "at", "the", "camera", *(f"word{i}" for i in range(25))]
+    known = {word: i for i, word in enumerate(words)}
+    made = Tokenizer(models.WordLevel(known, unk_token="<unk>"))
+    made.pre_tokenizer = pre_tokenizers.Whitespace()
+    made.add_special_tokens(["<loc>"])
+    (tmp_path / "words").mkdir()
+    made.save(str(tmp_path / "words" / "tokenizer.json"))
+    tokenizer = {"type": "PretrainedTokenizer", "model_path": str(tmp_path / "words")}
+    transforms = [
+        {"type": "ResizeImages", "height": 12, "width": 16},
+        {"type": "NormalizeStatesAndActions", "norm_type": "mean_std"},
+        {"type": "ProcessPrompts", "tokenizer": tokenizer, "max_len": 8},
+    ]
+    VLAS.register_module()(ReadingVLA)
+    yield lambda **model: save(
+        tmp_path,
+        config={"model": {"type": "ReadingVLA", **model}},
+        dataset={"transforms": transforms},
+    )
+    VLAS.unregister("ReadingVLA")
+
+
+def test_an_instruction_with_a_token_that_the_model_does_not_embed(reading):
+    place = reading()
+    policy = load(place)
+    assert policy.predict_action(observation()).shape == (4, 2)
+    typed = {**observation(), "task_description": "wave at <loc>"}
+    said = f"the instruction 'wave at <loc>' has the token 30; the policy of {place} knows those"
+    with pytest.raises(ConfigError, match=re.escape(f"{said} below 30")) as error:
+        policy.predict_action(typed)
+    assert error.value.next == "use other words, or name the model's own tokenizer"
+    assert policy.predict_action(observation()).shape == (4, 2)
+
+
+def test_a_tokenizer_of_more_words_than_the_model_embeds(reading):
+    place = reading(words=29)
+    words = "model.words: ReadingVLA: ids of tokens are below 29, in the data they go up to 29"
+    with pytest.raises(SpecMismatch, match=words) as error:
+        load(place)
+    assert error.value.where == str(place)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ class BaseSized(VLA, torch.nn.Module):
         horizon="vla_head.horizon",
         n_obs_steps="n_obs",
         embodiments=3,
+        vocabulary=50,
         float_images=True,
     )
 
@@ -96,6 +98,7 @@ def test_sizes_are_arguments_their_defaults_those_of_parts_and_of_base_classes()
         "horizon": Declared("vla_head.horizon", 8),
         "n_obs_steps": Declared("n_obs", 1),
         "embodiments": Declared("", 3),
+        "vocabulary": Declared("", 50),
         "float_images": Declared("", True),
     }
     assert chunk_of(found) == (8, 7)
@@ -143,6 +146,11 @@ def test_what_fits_is_no_misfit():
         ({"actions": [np.zeros((8, 4))]}, "action_dim", "is 7, in the data it is 4"),
         ({"embodiment_ids": torch.tensor([3])}, "", "are below 3, in the data one is 3"),
         ({"embodiment_ids": torch.tensor([-1])}, "", "are below 3, in the data one is -1"),
+        (
+            {"lang_tokens": torch.tensor([[7, 50, 8]])},
+            "",
+            "ids of tokens are below 50, in the data they go up to 50",
+        ),
     ],
 )
 def test_a_misfit_names_the_key_and_both_values(change, key, words):
@@ -150,6 +158,13 @@ def test_a_misfit_names_the_key_and_both_values(change, key, words):
     assert found.key == key
     assert found.text.startswith("Sized: ")
     assert words in found.text
+
+
+def test_words_that_the_batch_does_not_have_count_too():
+    shown = batch(lang_tokens=torch.tensor([[7, 49, 8]]))
+    assert misfits(TABLE, shown, tokens=50) == []
+    (found,) = misfits(TABLE, shown, tokens=51)
+    assert found.text == "Sized: ids of tokens are below 50, in the data they go up to 50"
 
 
 class Data:
@@ -184,6 +199,33 @@ def test_the_first_sample_of_every_dataset_is_compared():
         with pytest.raises(ConfigError, match=wrong) as error:
             check_data(context(), data, stack)
         assert "or those that a transform pads them to" in str(error.value)
+
+
+class Words:
+    """A tokenizer of so many words."""
+
+    def __init__(self, count):
+        self.base_vocab_size = count
+
+    def encode(self, text):
+        return [0]
+
+
+@pytest.mark.parametrize("tokenizer", [None, object(), Words(50), Words(None)])
+def test_a_tokenizer_that_fits_or_does_not_say_how_many_words_it_has(tokenizer):
+    data = Data()
+    data.pipeline = SimpleNamespace(transforms=[SimpleNamespace(tokenizer=tokenizer)])
+    check_data(context(), data, stack)
+
+
+def test_the_tokenizer_of_every_dataset_is_compared():
+    other = Data()
+    other.pipeline = SimpleNamespace(transforms=[SimpleNamespace(tokenizer=Words(60))])
+    wrong = "a.py:3: model: Sized: ids of tokens are below 50, in the data they go up to 59"
+    for data in (other, Data(datasets=[Data(), other])):
+        with pytest.raises(ConfigError, match=wrong) as error:
+            check_data(context(), data, stack)
+        assert "let the transforms' tokenizer be the one of the model" in error.value.next
 
 
 def test_a_dataset_need_not_keep_its_frames_in_memory_for_it():

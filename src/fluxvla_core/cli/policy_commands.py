@@ -67,7 +67,7 @@ class Export:
                 about = f"model.safetensors of {size / 1e6:.1f} MB and what it needs to act"
             else:
                 path = export_foreign(args.checkpoint, args.folder, args.format)
-                about = f"as {args.format} saves one"
+                about = f"a checkpoint in the format of {args.format}"
         say(f"{path}: {about}")
         return 0
 

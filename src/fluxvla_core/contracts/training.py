@@ -45,7 +45,7 @@ class InputSizes:
     """Sizes of the batches that a model takes, as arguments of its constructor say them.
 
     Data, robots and checkpoints are compared with them before a model is built. Each is the name of
-    an argument (``vla_head.horizon``: of the table ``vla_head``; ``a | b``: of the one that is
+    an argument (``vla_head.horizon``: of the table ``vla_head``; ``a | b``: of the first that is
     set), a number or two, or such a name and a function of the value. None is any size, also as a
     value.
 
@@ -55,6 +55,7 @@ class InputSizes:
         states, actions: numbers of a state and of an action, behind the transforms.
         horizon: actions of a chunk.
         embodiments: robots that there are weights for; ``embodiment_ids`` are below it.
+        vocabulary: tokens that the model embeds; ``lang_tokens`` are below it.
         n_obs_steps, past_actions: as of ``VLA``.
         float_images: images are floats, which a transform has to make of bytes.
     """
@@ -65,6 +66,7 @@ class InputSizes:
     actions: Size = None
     horizon: Size = None
     embodiments: Size = None
+    vocabulary: Size = None
     n_obs_steps: Size = None
     past_actions: Size = None
     float_images: bool = False
@@ -385,6 +387,8 @@ class Tokenizer(Contract):
     pad_token_id: int | None = None
     model_path: str | None = None
     """The path or name that it was loaded from, as in a config."""
+    base_vocab_size: int | None = None
+    """Number of ids without added tokens: with a model that embeds fewer, no training begins."""
 
     @abstractmethod
     def encode(self, text: str) -> Sequence[int]:

@@ -46,6 +46,7 @@ class Example:
         cameras: name -> height and width in the data; None where they are not known.
         dataset: None where the sample is assumed.
         assumed: assumptions in place of missing knowledge.
+        stand_in: a tokenizer is absent, so that the ids of tokens are not those of the training.
     """
 
     sample: Sample
@@ -54,6 +55,7 @@ class Example:
     cameras: Mapping[str, tuple[int, int] | None]
     dataset: Dataset | None
     assumed: tuple[str, ...]
+    stand_in: bool
 
 
 def example(
@@ -86,7 +88,8 @@ def example(
     entry = dataset.statistics.get(dataset.statistic_name or "", {})
     states, actions = (_width(entry, key) for key in ("proprio", "action"))
     keys = first_dataset(table).get("img_keys", ())
-    return Example(sample, states, actions, _sizes(keys, joints), dataset, tuple(assumed))
+    sizes = _sizes(keys, joints)
+    return Example(sample, states, actions, sizes, dataset, tuple(assumed), _stands_in(known))
 
 
 def assumed_example(
@@ -126,7 +129,7 @@ def assumed_example(
     if isinstance(images, list) and len({image.shape for image in images}) == 1:
         sample["images"] = join_planes(split_images(images))
     sample = stack_steps([sample] * max(int(table.get("n_obs_steps", 1)), 1))
-    return Example(sample, states, actions, sizes, None, tuple(assumed))
+    return Example(sample, states, actions, sizes, None, tuple(assumed), _stands_in(table))
 
 
 def unit_statistics(width: int) -> dict[str, list[float]]:
@@ -174,6 +177,11 @@ def _with_tokenizers(table: Mapping[str, Any], assumed: list[str]) -> dict[str, 
             assumed.append(f"{error.what}: tokens are assumed")
         transforms.append({**transform, "tokenizer": tokenizer})
     return {**table, "transforms": transforms} if transforms else dict(table)
+
+
+def _stands_in(table: Mapping[str, Any]) -> bool:
+    tables = [t for t in table.get("transforms", ()) if isinstance(t, Mapping)]
+    return any(isinstance(t.get("tokenizer"), StandInTokenizer) for t in tables)
 
 
 def _sizes(keys: Sequence[str], robot: EmbodimentSpec | None) -> dict[str, tuple[int, int] | None]:

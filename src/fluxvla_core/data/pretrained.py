@@ -49,6 +49,7 @@ class PretrainedTokenizer(Tokenizer):
         self._tokenizer.no_padding()
         self._tokenizer.no_truncation()
         self.pad_token_id = self._find_pad()
+        self.base_vocab_size = self._count_words()
 
     @property
     def vocab_size(self) -> int:
@@ -79,6 +80,14 @@ class PretrainedTokenizer(Tokenizer):
         for name in _FILES:
             if (self.folder / name).is_file():
                 shutil.copyfile(self.folder / name, target / name)
+
+    def _count_words(self) -> int:
+        """The number of ids up to the last that is not an added token's."""
+        count = int(self._tokenizer.get_vocab_size(with_added_tokens=False))
+        added: dict[int, Any] = getattr(self._tokenizer, "get_added_tokens_decoder", dict)()
+        while count - 1 in added:  # some files have added tokens among the words, too
+            count -= 1
+        return count
 
     def _find_pad(self) -> int:
         token = self._config.get("pad_token", "[PAD]")

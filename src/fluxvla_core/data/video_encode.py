@@ -98,8 +98,9 @@ class EpisodeEncoder:
             raise DataError(
                 f"{path.stem}: images of {height} x {width} cannot be stored as video",
                 cause="height and width must be even",
-                next="collect them in another size (data collect: --cameras NAME --height H "
-                "--width W), or crop a pixel where they are made and say so in the embodiment",
+                next=f"collect them with --height {height + height % 2} --width "
+                f"{width + width % 2}, or crop a pixel where they are made and say so in the "
+                "embodiment",
             )
         if codec.encoder == "libsvtav1":
             os.environ.setdefault("SVT_LOG", "1")  # errors only; it prints a page a stream

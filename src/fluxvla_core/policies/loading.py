@@ -66,6 +66,7 @@ def load_policy(
     """
     from fluxvla_core.policies.execution import check_execution
     from fluxvla_core.policies.inference_weights import check_quantization, ready
+    from fluxvla_core.training.input_sizes import declared_sizes, token_count
 
     check_execution(execution)
     check_quantization(quantization, device)
@@ -100,7 +101,9 @@ def load_policy(
     )
     if not own_objects:  # somebody's own may count what they are asked
         batch = _try(prepare, denormalize, embodiment, int(facts["horizon"]), where)
-        _check_sizes(config.get("model"), batch, int(facts["horizon"]), where)
+        tokens = token_count(InferenceDataset.adapt(prepare).pipeline)
+        _check_sizes(config.get("model"), batch, tokens, int(facts["horizon"]), where)
+    vocabulary = declared_sizes(config.get("model")).get("vocabulary")
     keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
     cameras = tuple(camera_name(key) for key in keys)
     if check is not None:
@@ -122,6 +125,7 @@ def load_policy(
         precision=mixed_precision_dtype,
         source=where,
         execution=execution,
+        vocabulary=None if vocabulary is None else vocabulary.value,
     )
 
 
@@ -207,7 +211,9 @@ def _try(
     return try_preparation(prepare, denormalize, sizes, robot.state_dim, chunk, where)
 
 
-def _check_sizes(table: Any, batch: Mapping[str, Any], horizon: int, where: str) -> None:
+def _check_sizes(
+    table: Any, batch: Mapping[str, Any], tokens: int, horizon: int, where: str
+) -> None:
     """Compare a checkpoint's ``model`` table with what it would be given, before it is built.
 
     Raises:
@@ -216,7 +222,7 @@ def _check_sizes(table: Any, batch: Mapping[str, Any], horizon: int, where: str)
     from fluxvla_core.training.input_sizes import advice, declared_sizes, misfits
 
     sizes = declared_sizes(table)
-    wrong = misfits(table, batch, sizes)
+    wrong = misfits(table, batch, sizes, tokens=tokens)
     found = [f"model.{one.key}: {one.text}" for one in wrong]
     chunk = sizes.get("horizon")
     if chunk is not None and chunk.value != horizon:

@@ -14,8 +14,9 @@ import numpy.typing as npt
 from fluxvla_core.contracts.frame import Observation
 from fluxvla_core.contracts.policy import Continuation, Policy
 from fluxvla_core.contracts.training import VLA
-from fluxvla_core.errors import ConfigError, DataError
+from fluxvla_core.errors import ConfigError, DataError, quoted
 from fluxvla_core.spec import EmbodimentSpec
+from fluxvla_core.training.input_sizes import largest_token
 
 if TYPE_CHECKING:
     from fluxvla_core.policies.execution import Transfer
@@ -59,6 +60,8 @@ class LocalPolicy(Policy):
         precision: ``float32`` or ``bf16`` (autocast).
         source: where it came from, for records.
         execution: ``eager``, ``compiled`` or ``graph``: see ``policies.execution``.
+        vocabulary: tokens that the model embeds; an instruction with another one is refused. None
+            if unknown.
 
     Raises:
         ConfigError: a precision or an execution is unknown, or not available here.
@@ -89,6 +92,7 @@ class LocalPolicy(Policy):
         precision: str = "float32",
         source: str = "",
         execution: str = "eager",
+        vocabulary: int | None = None,
     ) -> None:
         if precision not in PRECISIONS:
             raise ConfigError(
@@ -106,6 +110,7 @@ class LocalPolicy(Policy):
         self.stages, self.parts = {}, {}
         self._prepare = prepare
         self._denormalize = denormalize
+        self._vocabulary = vocabulary
         self.device = device
         self.precision = precision
         self._seed = 0
@@ -264,7 +269,8 @@ class LocalPolicy(Policy):
         """A batch of one; of several observations, with their images and states stacked.
 
         Raises:
-            ConfigError: the observation has not the history that the model needs.
+            ConfigError: the observation has not the history that the model needs, or a token that
+                the model does not embed.
         """
         import torch
 
@@ -280,6 +286,15 @@ class LocalPolicy(Policy):
             )
         rows = [self._prepare(self._sized(seen)) for seen in (*history, observation)]
         present: dict[str, Any] = rows[-1]
+        token = largest_token(present)
+        if self._vocabulary is not None and token >= self._vocabulary:
+            said = observation.get("task_description", "")
+            raise ConfigError(
+                f"the instruction {quoted(str(said))} has the token {token}; the policy of "
+                f"{self.source or 'this model'} knows those below {self._vocabulary}",
+                cause="the tokenizer is not the model's, or has added tokens that the model lacks",
+                next="use other words, or name the model's own tokenizer",
+            )
         several = [key for key in ("images", "states") if history and key in present]
         for key in several:
             present[key] = torch.stack([row[key] for row in rows], dim=1)

@@ -102,7 +102,7 @@ def dry_run(context: RunContext, processes: Sequence[int] = PROCESSES) -> DryRun
     shown = _validation(context, result, runner)
     if batch is not None:
         dataset = None if result.data is None else result.data.dataset
-        shown.insert(0, Samples("train_dataloader", dataset, [batch]))
+        shown.insert(0, Samples("train_dataloader", dataset, [_real(batch, result.data)]))
     result.refused = result.refused or _unfit(context, result, runner, sizes, shown)
     if sizes and not result.unfit:
         model = _model(context, result, runner)
@@ -333,7 +333,16 @@ def _validation(
     except Exception as error:  # noqa: BLE001 - datasets and transforms of others
         result.notes.append(f"the validation data are not known: {_one_line(error)}")
         return []
-    return [] if data.dataset is None else [Samples("val_dataloader", data.dataset, [batch])]
+    if data.dataset is None:
+        return []
+    return [Samples("val_dataloader", data.dataset, [_real(batch, data)])]
+
+
+def _real(batch: Mapping[str, Any], data: Example | None) -> Mapping[str, Any]:
+    """``batch`` without tokens of a tokenizer that is not the training's."""
+    if data is None or not data.stand_in:
+        return batch
+    return {key: value for key, value in batch.items() if key != "lang_tokens"}
 
 
 def _widths(model: Any, chunk: tuple[int, int] | None) -> tuple[int, int]:

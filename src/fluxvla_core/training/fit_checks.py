@@ -24,6 +24,7 @@ from fluxvla_core.training.input_sizes import (
     advice,
     declared_sizes,
     misfits,
+    token_count,
 )
 
 _OBSERVATIONS = {"n_obs_steps": 1, "past_actions": 0}
@@ -90,12 +91,14 @@ def unfit(
     table, problems, todo = context.config["model"], [], []
     takes = observations_in(table, sizes)
     for samples in shown:
+        tokens = 0
         if samples.dataset is not None:
+            tokens = _token_count(samples.dataset)
             found = _other_observations(takes, samples.dataset, context, samples.section)
             problems += [problem for problem, _ in found]
             todo += [change for _, change in found]
         for batch in samples.batches:
-            wrong = misfits(table, batch, sizes, _DATA[samples.section])
+            wrong = misfits(table, batch, sizes, _DATA[samples.section], tokens)
             problems += [_problem(one, context) for one in wrong]
             todo += [advice([one]) for one in wrong]
     return _listed(problems, todo) if problems else None
@@ -256,6 +259,13 @@ def _parts(dataset: Any) -> Iterator[Dataset]:
     if not described.datasets:
         uncached = getattr(dataset, "uncached", None)
         yield described if uncached is None else Dataset.adapt(uncached())
+
+
+def _token_count(dataset: Any) -> int:
+    """The largest number of ids of the tokenizers of a dataset, or of those it is made of."""
+    described = Dataset.adapt(dataset)
+    inner = max((_token_count(part) for part in described.datasets), default=0)
+    return max(inner, token_count(described.pipeline))
 
 
 def _related(theirs: Any, ours: Any, key: str) -> bool:

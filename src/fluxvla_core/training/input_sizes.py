@@ -15,7 +15,8 @@ import numpy as np
 
 from fluxvla_core.build import class_of, constructors
 from fluxvla_core.config.resolve import SLOTS
-from fluxvla_core.contracts.training import InputSizes, Size
+from fluxvla_core.contracts.contract import implements
+from fluxvla_core.contracts.training import InputSizes, Size, Tokenizer
 from fluxvla_core.errors import FluxError
 from fluxvla_core.plugins.registry import BY_NAME, VLAS
 
@@ -32,6 +33,7 @@ _ADVICE = {
     "image_size": "let a transform resize images",
     "states": _PADDED,
     "actions": _PADDED,
+    "vocabulary": "let the transforms' tokenizer be the one of the model",
     "horizon": "the chunk is as long as action_window_size of the dataset",
     "embodiments": "embodiment_id of the dataset is the robot's number",
     "float_images": "let a transform normalise images",
@@ -86,6 +88,7 @@ def misfits(
     batch: Mapping[str, Any],
     sizes: Mapping[str, Declared] | None = None,
     data: str = "the data",
+    tokens: int = 0,
 ) -> list[Misfit]:
     """Where ``batch`` has other sizes than the model of ``table`` takes.
 
@@ -94,18 +97,22 @@ def misfits(
             an entry for each sample. What it does not have is not compared.
         sizes: those of ``table``, if they are known.
         data: where the batch is from, for the text.
+        tokens: number of ids that its tokenizer has, see ``token_count``: another instruction than
+            that of ``batch`` may have any of them.
     """
     sizes = declared_sizes(table) if sizes is None else sizes
     if not sizes:
         return []
     who = getattr(class_of(table["type"], VLAS), "__name__", str(table["type"]))
     found = []
-    for size, have in _sizes_of(batch).items():
+    for size, have in _sizes_of(batch, tokens).items():
         one = sizes.get(size)
         if one is None or _fits(size, one.value, have):
             continue
         if size == "embodiments":
             text = f"embodiment_ids are below {one.value}, in {data} one is {have}"
+        elif size == "vocabulary":
+            text = f"ids of tokens are below {one.value}, in {data} they go up to {have}"
         elif size == "float_images":
             text = f"images are normalised floats, in {data} they are {have}"
         else:
@@ -142,13 +149,18 @@ def _read(cls: type, table: Mapping[str, Any], stated: Size) -> Declared | None:
 
 
 def _argument(cls: type, table: Mapping[str, Any], name: str) -> Any:
-    """The value of an argument, ``part.argument`` of a part's table, or its default."""
+    """The value of an argument or its default, ``part.argument`` or ``table.key`` of a table's."""
     first, _, rest = name.partition(".")
     value = table[first] if first in table else _default(cls, first)
     if not rest or value is None:
         return value
     if not isinstance(value, Mapping):
         return getattr(value, rest, None)  # a part that is built already
+    if first not in SLOTS:  # a table of sizes
+        found: Any = value
+        for key in rest.split("."):
+            found = found.get(key)
+        return found
     inner = class_of(value.get("type"), BY_NAME[SLOTS[first]])
     return _argument(inner, value, rest)
 
@@ -162,7 +174,20 @@ def _default(cls: type, name: str) -> Any:
     return None
 
 
-def _sizes_of(batch: Mapping[str, Any]) -> dict[str, Any]:
+def largest_token(batch: Mapping[str, Any]) -> int:
+    """The largest id of a batch's ``lang_tokens``; -1 without any."""
+    tokens = batch.get("lang_tokens")
+    return -1 if tokens is None or not np.size(tokens) else int(np.max(np.asarray(tokens)))
+
+
+def token_count(pipeline: Any) -> int:
+    """Ids, without added tokens, that the tokenizers of a ``Pipeline`` have; 0 if unknown."""
+    found = (getattr(t, "tokenizer", None) for t in getattr(pipeline, "transforms", ()))
+    tokenizers = (Tokenizer.adapt(t) for t in found if implements(t, Tokenizer, "encode"))
+    return max((t.base_vocab_size or 0 for t in tokenizers), default=0)
+
+
+def _sizes_of(batch: Mapping[str, Any], tokens: int) -> dict[str, Any]:
     """The sizes that a batch has, by the fields of ``InputSizes``."""
     found: dict[str, Any] = {}
     images, states, actions = (_shape(batch.get(key)) for key in ("images", "states", "actions"))
@@ -177,6 +202,9 @@ def _sizes_of(batch: Mapping[str, Any]) -> dict[str, Any]:
     ids = batch.get("embodiment_ids")
     if ids is not None and np.size(ids):
         found["embodiments"] = int(np.max(np.asarray(ids)))
+    highest = max(largest_token(batch), tokens - 1)
+    if highest >= 0:
+        found["vocabulary"] = highest
     return found
 
 
@@ -188,7 +216,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 
 def _fits(size: str, takes: Any, has: Any) -> bool:
-    if size == "embodiments":
+    if size in ("embodiments", "vocabulary"):
         return 0 <= int(has) < int(takes)
     if size == "float_images":
         return "float" in has or not has

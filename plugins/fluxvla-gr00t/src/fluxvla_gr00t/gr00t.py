@@ -45,6 +45,7 @@ class GR00T(VLA, nn.Module):
         actions="vla_head.action_dim",
         horizon="vla_head.horizon",
         embodiments="vla_head.embodiments",
+        vocabulary="vlm_backbone.vocabulary",
         float_images=True,
     )
 

@@ -53,6 +53,7 @@ class FastTokenizer(PretrainedTokenizer):
 
     def __init__(self, model_path: str) -> None:
         super().__init__(model_path)
+        self.base_vocab_size = None  # a model's words stand for its ids
         self.scale, self.min_token = _settings(self.folder)
 
     def encode_actions(self, actions: npt.ArrayLike) -> list[int]:

@@ -60,6 +60,7 @@ class LlavaVLA(VLA, nn.Module):
         states="vla_head.state_dim",
         actions="vla_head.action_dim",
         horizon="vla_head.horizon",
+        vocabulary="llm_backbone.sizes.vocab_size | vlm_backbone.sizes.text_config.vocab_size",
         float_images=True,
     )
 

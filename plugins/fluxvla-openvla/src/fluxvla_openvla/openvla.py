@@ -20,7 +20,7 @@ from torch.nn import functional
 from fluxvla_core.models import InputSizes
 from fluxvla_openvla.language import Prompt, decode, hidden_states
 from fluxvla_openvla.prismatic import Prismatic
-from fluxvla_openvla.sizes import LanguageSize, TowerSize
+from fluxvla_openvla.sizes import LanguageSize, TowerSize, vocabulary
 
 BINS = 256
 _EDGES = np.linspace(-1.0, 1.0, BINS)
@@ -75,7 +75,12 @@ class OpenVLA(Prismatic):
     """
 
     input_sizes = InputSizes(
-        cameras=1, image_size="image_size", actions="action_dim", horizon=1, float_images=True
+        cameras=1,
+        image_size="image_size",
+        actions="action_dim",
+        horizon=1,
+        vocabulary=("language.vocab_size | language", vocabulary),
+        float_images=True,
     )
 
     def __init__(

@@ -25,7 +25,7 @@ from fluxvla_openvla.heads import (
 )
 from fluxvla_openvla.language import Prompt, hidden_states
 from fluxvla_openvla.prismatic import Prismatic
-from fluxvla_openvla.sizes import HEADS, LanguageSize, TowerSize
+from fluxvla_openvla.sizes import HEADS, LanguageSize, TowerSize, vocabulary
 
 
 class OpenVLAOFT(Prismatic):
@@ -58,6 +58,7 @@ class OpenVLAOFT(Prismatic):
         states=("state_dim", lambda width: width or None),
         actions="action_dim",
         horizon="horizon",
+        vocabulary=("language.vocab_size | language", vocabulary),
         float_images=True,
     )
 

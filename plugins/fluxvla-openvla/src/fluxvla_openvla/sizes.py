@@ -94,3 +94,10 @@ def read_size(table: Mapping[str, Any] | Size | None, default: Size, where: str)
             raise ConfigError(f"{where}.{key} must be of type {kind.__name__}, got {value!r}")
         values[key] = kind(value)
     return type(default)(**values)
+
+
+def vocabulary(language: int | Mapping[str, Any] | LanguageSize | None) -> int:
+    """Tokens that a language model of this size embeds; it may be their number itself."""
+    if isinstance(language, int):
+        return language
+    return read_size(language, LanguageSize(), "language").vocab_size

@@ -94,6 +94,7 @@ class PiFlowMatching(VLA, nn.Module):
         image_size=("vision_variant", image_side),
         actions="max_action_dim",
         horizon="n_action_steps",
+        vocabulary="vocab_size",
         float_images=True,
     )
 

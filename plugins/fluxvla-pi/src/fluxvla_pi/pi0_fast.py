@@ -61,6 +61,7 @@ class PI0FAST(VLA, nn.Module):
         image_size=("vision_variant", image_side),
         actions="action_dim",
         horizon="n_action_steps",
+        vocabulary="vocab_size",
         float_images=True,
     )
 

@@ -70,6 +70,11 @@ class LanguageModel(nn.Module):
         return KVCache(tuple(keys), tuple(values), cache_mask, count + 1)
 
 
+def _vocabulary(text: int | TextSize | Mapping[str, Any] | None) -> int:
+    """Of a table of sizes; it may be the number itself."""
+    return text if isinstance(text, int) else size_of(TextSize, text).vocabulary
+
+
 class SmolVLA(VLA, nn.Module):
     """Images, instruction and joint state in, action chunk out; 450 million parameters.
 
@@ -106,6 +111,7 @@ class SmolVLA(VLA, nn.Module):
         states="max_state_dim",
         actions="max_action_dim",
         horizon="n_action_steps",
+        vocabulary=("text.vocabulary | text", _vocabulary),
         float_images=True,
     )
 

@@ -2,7 +2,7 @@
 
     nox -s demo [-- --smoke | --full] [--fresh]     from demonstrations to an evaluated policy
     nox -s tests [-- PYTEST ARGUMENTS]              everything that CI checks
-    nox -s nightly [-- PYTEST ARGUMENTS]            the tests that take minutes each
+    nox -s nightly [-- PYTEST ARGUMENTS]            the slow tests, then docs, skew and py313
     nox -s oracles                                  the references in golden files, computed again
     nox -s skew [-- COMMIT]                         the released core with current plugins, and back
     nox -s py313 [-- PYTEST ARGUMENTS]              the tests without torch, on Python 3.13
@@ -112,7 +112,10 @@ def tests(session: nox.Session) -> None:
 
 @nox.session
 def nightly(session: nox.Session) -> None:
-    """The tests that take minutes each."""
+    """The tests that take minutes each; without arguments then docs, skew and py313."""
+    if not session.posargs:
+        for name in ("docs", "skew", "py313"):
+            session.notify(name)
     with Steps(session) as step:
         dev = dev_env(session)
         make_renderable(session, dev)

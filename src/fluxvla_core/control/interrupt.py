@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from contextlib import ExitStack
-from types import FrameType
+from types import FrameType, TracebackType
 
 from fluxvla_core.errors import RunFailed
 from fluxvla_core.signals import handling, requests_to_stop
@@ -74,7 +74,12 @@ class Interrupts:
         self._taken.enter_context(handling(self.on_signal, *numbers))
         return self
 
-    def __exit__(self, *details: object) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._taken.close()
 
     def check(self) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any, ClassVar
@@ -128,23 +127,6 @@ class BadFrame(RuleStop):
     """A frame is not what the embodiment describes."""
 
     rule = Rule.FRAME
-
-
-@contextmanager
-def bad_frames(call: str) -> Iterator[None]:
-    """Context manager: what is raised inside that is no error of a robot's is a ``BadFrame``.
-
-    Args:
-        call: the operator's method that reads a frame, for messages.
-    """
-    try:
-        yield
-    except FluxError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise BadFrame(
-            f"{call}, or what the runner makes of it, raised {type(error).__name__}: {error}"
-        ) from error
 
 
 class BadTiming(RuleStop):

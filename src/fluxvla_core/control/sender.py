@@ -86,13 +86,13 @@ class CommandPipeline:
         self._limiter = limiter
         self._filters = tuple(filters)
 
-    def form(self, targets: npt.ArrayLike) -> tuple[Array, list[list[Clamp]]]:
+    def form(self, targets: npt.ArrayLike, speed: float = 1.0) -> tuple[Array, list[list[Clamp]]]:
         """``(N, D)`` commands of ``(N, D)`` targets, and what of each was clamped.
 
         Raises:
             BadCommand: a target is not finite or of another shape.
         """
-        return self.limited(self.filtered(targets), 1.0)
+        return self.limited(self.filtered(targets), speed)
 
     def filtered(self, targets: npt.ArrayLike) -> Array:
         """``(N, D)`` targets after the filters.
@@ -102,7 +102,9 @@ class CommandPipeline:
         """
         return np.array([self._filter(row) for row in np.asarray(targets, dtype=np.float64)])
 
-    def limited(self, targets: npt.ArrayLike, speed: float) -> tuple[Array, list[list[Clamp]]]:
+    def limited(
+        self, targets: npt.ArrayLike, speed: float = 1.0
+    ) -> tuple[Array, list[list[Clamp]]]:
         """``(N, D)`` filtered targets within the limits; ``speed`` as ``CommandLimiter`` has it."""
         return self._limiter.run(targets, speed)
 

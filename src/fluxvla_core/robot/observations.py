@@ -20,9 +20,9 @@ import numpy as np
 from fluxvla_core.contracts.frame import STATE, Frame, Observation
 from fluxvla_core.contracts.policy import Policy, with_history
 from fluxvla_core.control.interrupt import Interrupts
-from fluxvla_core.control.safety import BadFrame, BadTiming, SafetySettings, bad_frames
+from fluxvla_core.control.safety import BadFrame, BadTiming, SafetySettings
 from fluxvla_core.control.tracking import TrackingWatch
-from fluxvla_core.errors import NotReady
+from fluxvla_core.errors import FluxError, NotReady
 from fluxvla_core.robot.events import Event, HistoryObserved, Observed, ObservedFrame, Refused
 from fluxvla_core.robot.robot import Observe, Robot, check_frame, is_number
 
@@ -147,8 +147,16 @@ class ObservationReader:
             BadFrame: it is no observation, or something was raised that is no error of a robot's.
         """
         robot = self.robot
-        with bad_frames(robot.frame_call.name), robot.delays.of(robot.frame_call):
-            observation, frame = self.observe()
+        try:
+            with robot.delays.of(robot.frame_call):
+                observation, frame = self.observe()
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise BadFrame(
+                f"{robot.frame_call.name}, or what the runner makes of it, "
+                f"raised {type(error).__name__}: {error}"
+            ) from error
         if not isinstance(observation, Mapping) or not isinstance(
             observation.get("images"), Mapping
         ):

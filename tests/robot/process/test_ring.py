@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fluxvla_core.robot.process.link import Ring
+from fluxvla_core.robot.process.ring import Ring
 
 POSITIONS = 64
 HEAD = slice(0, 8)
@@ -71,12 +71,11 @@ def test_a_full_ring_drops_and_counts_and_goes_on(size):
 @pytest.mark.parametrize("size", [64, 65, 71, 72])
 def test_the_largest_message_fits_and_a_larger_one_never_does(size):
     ring = Ring(memory(size))
-    largest = size // 8 * 8 - 8  # records are of whole words; one holds length and checksum
 
     for _ in range(3):
-        assert ring.write(b"x" * largest)
-        assert ring.read() == b"x" * largest
-        assert not ring.write(b"x" * (largest + 1))
+        assert ring.write(b"x" * ring.largest)
+        assert ring.read() == b"x" * ring.largest
+        assert not ring.write(b"x" * (ring.largest + 1))
     assert ring.dropped == 3
 
 
@@ -126,7 +125,7 @@ def test_a_record_of_the_lap_before_is_not_taken_for_a_new_one():
 WRITER = """
 import mmap, sys, time
 import numpy as np
-from fluxvla_core.robot.process.link import Ring
+from fluxvla_core.robot.process.ring import Ring
 
 memory = memoryview(mmap.mmap(int(sys.argv[1]), 0))
 ring, rng = Ring(memory), np.random.default_rng(7)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from fluxvla_core.contracts.frame import STATE
-from fluxvla_core.control.safety import BadFrame, BadTiming, bad_frames
+from fluxvla_core.control.safety import BadFrame, BadTiming
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.process.frames import (
     FrameChannel,
@@ -113,8 +113,15 @@ class UndividedRobot(Robot):
             message = message_of_frame(frame, self._cameras, self.frame_call.name)
             self._keep_state(frame.state, frame.stamps.get(STATE))
             return message
-        with bad_frames(self.frame_call.name):
+        try:
             window, made_of = self._observe()
+        except FluxError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise BadFrame(
+                f"{self.frame_call.name}, or what the runner makes of it, "
+                f"raised {type(error).__name__}: {error}"
+            ) from error
         message = message_of_observation(
             window, made_of, self._cameras, "update_observation_window()"
         )

@@ -95,12 +95,19 @@ def test_data_that_do_not_fit(
 ) -> None:
     config = tiny(family, tmp_path, data)
     calls = built(config)
-    command = ["run", "--config", str(config), "--section", "runner", "--set", change]
-    for more in (["--work-dir", str(tmp_path / "work")], ["--dry-run"]):
-        assert main([*command, *more]) == 2
-        assert words in capsys.readouterr().err
+    for said in refused(config, tmp_path / "work", capsys, "--set", change):
+        assert words in said
     assert not calls
-    assert not (tmp_path / "work").exists()
+
+
+def refused(
+    config: Path, work: Path, capsys: pytest.CaptureFixture[str], *words: str
+) -> Iterator[str]:
+    """What a training and a dry run say, which end with exit code 2 and leave no work dir."""
+    for more in (["--work-dir", str(work)], ["--dry-run"]):
+        assert main(["run", "--config", str(config), "--section", "runner", *words, *more]) == 2
+        yield capsys.readouterr().err
+    assert not work.exists()
 
 
 def test_a_prompt_for_other_cameras(
@@ -142,12 +149,9 @@ def test_a_tokenizer_of_more_words_than_the_model_embeds(
     config = tiny(family, tmp_path, data)
     write_tokenizers(tmp_path, family, more=2000)
     calls = built(config)
-    command = ["run", "--config", str(config), "--section", "runner"]
-    for more in (["--work-dir", str(tmp_path / "work")], ["--dry-run"]):
-        assert main([*command, *more]) == 2
-        assert f"{family}.py:1: {key}{TOKENS.format(*ids)}" in capsys.readouterr().err
+    for said in refused(config, tmp_path / "work", capsys):
+        assert f"{family}.py:1: {key}{TOKENS.format(*ids)}" in said
     assert not calls
-    assert not (tmp_path / "work").exists()
 
 
 def test_a_tokenizer_that_is_elsewhere_is_not_compared(data: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch")
 
 from fluxvla_core.errors import ConfigError
-from tests.policies.test_local_policy import ARM, models, save
+from tests.policies.saved import ARM, models, save
 
 __all__ = ["models"]  # a fixture
 

@@ -388,7 +388,7 @@ class Tokenizer(Contract):
     model_path: str | None = None
     """The path or name that it was loaded from, as in a config."""
     base_vocab_size: int | None = None
-    """Number of ids without added tokens: with a model that embeds fewer, no training begins."""
+    """Number of ids without added tokens; a model that embeds fewer is refused. None if unknown."""
 
     @abstractmethod
     def encode(self, text: str) -> Sequence[int]:

@@ -84,7 +84,7 @@ class PretrainedTokenizer(Tokenizer):
     def _count_words(self) -> int:
         """The number of ids up to the last that is not an added token's."""
         count = int(self._tokenizer.get_vocab_size(with_added_tokens=False))
-        added: dict[int, Any] = getattr(self._tokenizer, "get_added_tokens_decoder", dict)()
+        added = self._tokenizer.get_added_tokens_decoder()
         while count - 1 in added:  # some files have added tokens among the words, too
             count -= 1
         return count

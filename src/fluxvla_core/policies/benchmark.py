@@ -184,10 +184,9 @@ def untrained_policy(
     import torch
 
     from fluxvla_core.policies.inference_weights import check_quantization, ready
-    from fluxvla_core.training.input_sizes import declared_sizes
+    from fluxvla_core.training.input_sizes import declared_sizes, vocabulary_of
 
     check_quantization(quantization, device)
-    vocabulary = declared_sizes(config["model"]).get("vocabulary")
     torch.manual_seed(seed)
     model = build_vla_from_cfg(config["model"])
     horizon, _ = model.action_shape
@@ -202,7 +201,7 @@ def untrained_policy(
         device=device,
         precision=precision,
         source="random weights",
-        vocabulary=None if vocabulary is None else vocabulary.value,
+        vocabulary=vocabulary_of(declared_sizes(config["model"])),
     )
 
 

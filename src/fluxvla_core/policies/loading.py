@@ -26,6 +26,14 @@ from fluxvla_core.errors import CheckpointError, ConfigError, SpecMismatch, loca
 from fluxvla_core.plugins.registry import DATASETS, TRANSFORMS, VLAS, Registry
 from fluxvla_core.policies.local import LocalPolicy
 from fluxvla_core.spec import EmbodimentSpec
+from fluxvla_core.training.input_sizes import (
+    Declared,
+    advice,
+    declared_sizes,
+    misfits,
+    token_count,
+    vocabulary_of,
+)
 
 log = logging.getLogger("fluxvla.policies")
 
@@ -66,7 +74,6 @@ def load_policy(
     """
     from fluxvla_core.policies.execution import check_execution
     from fluxvla_core.policies.inference_weights import check_quantization, ready
-    from fluxvla_core.training.input_sizes import declared_sizes, token_count
 
     check_execution(execution)
     check_quantization(quantization, device)
@@ -99,11 +106,11 @@ def load_policy(
         given is not None and not isinstance(given, Mapping)
         for given in (dataset, denormalize_action)
     )
+    sizes = declared_sizes(config.get("model"))
     if not own_objects:  # somebody's own may count what they are asked
         batch = _try(prepare, denormalize, embodiment, int(facts["horizon"]), where)
         tokens = token_count(InferenceDataset.adapt(prepare).pipeline)
-        _check_sizes(config.get("model"), batch, tokens, int(facts["horizon"]), where)
-    vocabulary = declared_sizes(config.get("model")).get("vocabulary")
+        _check_sizes(config.get("model"), sizes, batch, tokens, int(facts["horizon"]), where)
     keys = tuple(getattr(prepare, "img_keys", embodiment.camera_names))
     cameras = tuple(camera_name(key) for key in keys)
     if check is not None:
@@ -125,7 +132,7 @@ def load_policy(
         precision=mixed_precision_dtype,
         source=where,
         execution=execution,
-        vocabulary=None if vocabulary is None else vocabulary.value,
+        vocabulary=vocabulary_of(sizes),
     )
 
 
@@ -212,16 +219,23 @@ def _try(
 
 
 def _check_sizes(
-    table: Any, batch: Mapping[str, Any], tokens: int, horizon: int, where: str
+    table: Any,
+    sizes: Mapping[str, Declared],
+    batch: Mapping[str, Any],
+    tokens: int,
+    horizon: int,
+    where: str,
 ) -> None:
     """Compare a checkpoint's ``model`` table with what it would be given, before it is built.
+
+    Args:
+        sizes: those that ``table`` declares.
+        batch: a prepared observation.
+        tokens: number of ids of its tokenizer, see ``token_count``.
 
     Raises:
         SpecMismatch: it takes something else; names the keys and both values.
     """
-    from fluxvla_core.training.input_sizes import advice, declared_sizes, misfits
-
-    sizes = declared_sizes(table)
     wrong = misfits(table, batch, sizes, tokens=tokens)
     found = [f"model.{one.key}: {one.text}" for one in wrong]
     chunk = sizes.get("horizon")

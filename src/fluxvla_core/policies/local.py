@@ -286,8 +286,7 @@ class LocalPolicy(Policy):
             )
         rows = [self._prepare(self._sized(seen)) for seen in (*history, observation)]
         present: dict[str, Any] = rows[-1]
-        token = largest_token(present)
-        if self._vocabulary is not None and token >= self._vocabulary:
+        if self._vocabulary is not None and (token := largest_token(present)) >= self._vocabulary:
             said = observation.get("task_description", "")
             raise ConfigError(
                 f"the instruction {quoted(str(said))} has the token {token}; the policy of "

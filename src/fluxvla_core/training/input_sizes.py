@@ -83,6 +83,11 @@ def chunk_of(sizes: Mapping[str, Declared]) -> tuple[int, int] | None:
     return (both[0], both[1]) if len(both) == 2 else None
 
 
+def vocabulary_of(sizes: Mapping[str, Declared]) -> int | None:
+    """The number of tokens that the model embeds, where it is declared."""
+    return sizes["vocabulary"].value if "vocabulary" in sizes else None
+
+
 def misfits(
     table: Any,
     batch: Mapping[str, Any],

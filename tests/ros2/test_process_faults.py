@@ -197,8 +197,10 @@ def test_a_machine_that_stands_still_is_no_hung_control_process(stage, tmp_path)
         running.wait_for(lambda: False, "the end", END_S)
         said = running.said
     assert "nothing commands the robot any more" not in said
-    # The state was too old for a moment, or nothing was wrong until Ctrl-C.
-    assert running.process.returncode in (1, 130), said
+    # The state was too old for a moment, or nothing was wrong until Ctrl-C. In the first case
+    # Ctrl-C may find Python ending, where SIGINT ends it at once.
+    ended = [1, 130] + ([-signal.SIGINT] if "is silent for" in said else [])
+    assert running.process.returncode in ended, said
 
 
 def test_an_arm_of_a_plugin_file(stage, tmp_path):

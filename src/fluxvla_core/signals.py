@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -42,8 +42,7 @@ def leave_stopping_to_the_parent() -> None:
     from multiprocessing.connection import wait
 
     numbers = requests_to_stop()
-    for number in numbers:
-        signal.signal(number, signal.SIG_IGN)
+    ignore(numbers)
     # The parent may have held them back until they are ignored.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
     parent = parent_process()
@@ -70,11 +69,28 @@ def held_back(start_method: str) -> Iterator[None]:
 
         # It would start with the first process, and unblock the signals.
         resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, requests_to_stop())
+    with blocked(requests_to_stop()):
+        yield
+
+
+@contextmanager
+def blocked(numbers: Iterable[int]) -> Iterator[None]:
+    """Block these signals in this thread inside; those that came meanwhile are handled after."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def ignore(numbers: Iterable[int]) -> None:
+    """Ignore these signals from now on, also those that are blocked and pending.
+
+    Only the main thread can set handlers: in another one nothing changes.
+    """
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import pytest
 from fluxvla_core.cli.main import main
 from fluxvla_core.config import source
 from fluxvla_core.plugins.registry import BY_NAME
+from fluxvla_core.signals import requests_to_stop
 
 Write = Callable[[str, str], Path]
 
@@ -126,12 +128,15 @@ Fluxvla = Callable[..., Ended]
 
 @pytest.fixture(autouse=True)
 def _as_it_was(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Registries, parsed sources and rank variables as they were."""
+    """Registries, parsed sources, signal handlers and rank variables as they were."""
     before = {name: dict(registry._here) for name, registry in BY_NAME.items()}
+    handlers = {number: signal.getsignal(number) for number in requests_to_stop()}
     for name in ("RANK", "WORLD_SIZE", "FLUXVLA_STRICT", "FLUXVLA_ERROR_DIR"):
         monkeypatch.delenv(name, raising=False)
     source.parse.cache_clear()
     yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     for name, registry in BY_NAME.items():
         registry._here.clear()
         registry._here.update(before[name])

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -265,6 +266,33 @@ def test_a_launched_rank_leaves_its_error_to_the_launcher(
     monkeypatch.setenv(ranks.ERROR_DIR, str(tmp_path / "gone"))
     ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=denied")
     assert "a.mp4: bad data" in ended.err
+
+
+def test_a_rank_that_failed_ignores_signals_while_it_reports(
+    run: Fluxvla, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The agent asks all ranks to stop as soon as one has failed: also this one."""
+    second_of_two(monkeypatch, tmp_path)
+    record, numbers = ranks.record_failure, (signal.SIGINT, signal.SIGTERM)
+
+    def signalled(*args: Any, **fields: Any) -> bool:
+        for number in numbers:
+            os.kill(os.getpid(), number)
+        return record(*args, **fields)
+
+    monkeypatch.setattr(ranks, "record_failure", signalled)
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=denied")
+    assert (ended.code, ranks.failures(tmp_path)[1].text) == (
+        2,
+        "a.mp4: bad data\n  next: look at it",
+    )
+    assert [signal.getsignal(number) for number in numbers] == [signal.SIG_IGN] * 2
+
+
+def test_a_process_without_an_agent_has_its_handlers_back_after_an_error(run: Fluxvla) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    ended = run("--config", "c.py", "--section", "runner", "--set", "runner.mode+=denied")
+    assert (ended.code, signal.getsignal(signal.SIGTERM)) == (2, before)
 
 
 def test_a_launched_rank_that_is_done_says_so(

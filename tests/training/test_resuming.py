@@ -328,3 +328,20 @@ def test_a_signal_saves_and_the_run_goes_on_exactly(tmp_path, number):
     ends = [folders(tmp_path / name)[-1] for name in ("whole", "cut")]
     assert checkpoint_differences(*ends) == []
     assert "metrics.jsonl" not in differences(tmp_path / "whole", tmp_path / "cut")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_a_run_closes_changes_nothing(tmp_path, number):
+    """All is saved by then: the run ended well, and says that it was asked to stop."""
+    runner = make(tmp_path)
+    runner.run_setup(37)
+    close = runner._close
+
+    def signalled(outcome):
+        os.kill(os.getpid(), number)
+        close(outcome)
+
+    runner._close = signalled
+    assert runner.run(TinyDataset()) == tmp_path
+    assert runner.late_stop == number
+    assert [p.name for p in folders(tmp_path)][-1] == "step-000000006"

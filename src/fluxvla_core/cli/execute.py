@@ -6,7 +6,14 @@ import argparse
 import errno
 import signal
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    closing,
+    contextmanager,
+    nullcontext,
+    suppress,
+)
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +23,7 @@ from fluxvla_core.cli.plan import Plan
 from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.signals import handling, requests_to_stop
+from fluxvla_core.signals import blocked, handling, ignore, requests_to_stop
 
 
 def execute(plan: Plan, args: argparse.Namespace) -> int:
@@ -190,15 +197,28 @@ class _Terminated(BaseException):
 def stopped_by_signals() -> Iterator[None]:
     """SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that everything is closed.
 
-    A robot's or a training's loop handles the signals itself while it runs.
+    A robot's or a training's loop handles the signals itself while it runs. A rank that failed
+    ignores them from then on, SIGINT as well: torch's agent asks all ranks to stop as soon as one
+    of them has failed, and this one's own error is still to be reported.
     """
 
     def handle(number: int, frame: Any) -> None:
         raise _Terminated(number)
 
+    numbers = requests_to_stop()
+    handled = ExitStack()
+    handled.enter_context(handling(handle, *(n for n in numbers if n != signal.SIGINT)))
     try:
-        with handling(handle, *(n for n in requests_to_stop() if n != signal.SIGINT)):
-            yield
+        with handled:
+            try:
+                yield
+            except BaseException:
+                if ranks.has_agent():
+                    # Blocked, so that none is handled, or ends the process, in between.
+                    with blocked(numbers):
+                        handled.close()
+                        ignore(numbers)
+                raise
     except _Terminated as ended:
         name = signal.Signals(ended.args[0]).name
         raise RunFailed(f"stopped by {name}", reason="stopped") from None

@@ -104,8 +104,9 @@ class BaseTrainRunner(Strategy):
         self._join()
         self.progress = Progress()
         outcome = "failed"
-        try:
-            with StopRequest(self.world, self.check_work_dir) as stop:
+        # Until everything is closed: what the run has saved is not to be lost by a signal.
+        with StopRequest(self.world, self.check_work_dir) as stop:
+            try:
                 self._trainer = Trainer(self, vla_dataset, stop)
                 signal = (
                     self._run_epoch_based() if self.max_steps is None else self._run_step_based()
@@ -113,19 +114,20 @@ class BaseTrainRunner(Strategy):
                 self._trainer.save()
                 self.finish_pending_save()
                 self.late_stop = stop.poll_now()
-            outcome = "interrupted" if signal else "ok"
-        except (RuntimeError, MemoryError, OSError, RunFailed) as error:
-            self.check_work_dir()
-            if isinstance(error, RunFailed):
-                raise
-            known = explain(error, self.progress.step + 1, self.world)
-            if known is None:
-                raise
-            raise known from error
-        finally:
-            self._close(outcome)
+                outcome = "interrupted" if signal else "ok"
+            except (RuntimeError, MemoryError, OSError, RunFailed) as error:
+                self.check_work_dir()
+                if isinstance(error, RunFailed):
+                    raise
+                known = explain(error, self.progress.step + 1, self.world)
+                if known is None:
+                    raise
+                raise known from error
+            finally:
+                self._close(outcome)
         if signal:
             raise stopped(signal, f"step {self.progress.step} in {self.context.work_dir}")
+        self.late_stop = self.late_stop or stop.received
         return self.context.work_dir
 
     def _close(self, outcome: str) -> None:

@@ -58,6 +58,11 @@ class StopRequest:
         if not self._signal:
             self._signal, self._since = number, time.monotonic()
 
+    @property
+    def received(self) -> int:
+        """The first signal that this rank got, or 0."""
+        return self._signal
+
     def set_interval(self, step_time: float) -> None:
         """Choose every how many steps ranks synchronise; ``step_time`` (s), equal on all ranks."""
         self._every = max(1, int(NOTICE_S / step_time)) if step_time > 0 else 1

@@ -16,6 +16,7 @@ _POLL_S = 0.05
 # than this share of that. While native code computes without releasing the GIL, looks come
 # late as well, but the process is busy: that is not the machine's doing.
 _STALL_S, _BUSY_SHARE = 0.2, 0.25
+_STALLS_KEPT = 32
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,29 @@ class _Span:
     ended: float
 
 
+@dataclass(frozen=True)
+class _Look:
+    """What the watching thread found when it looked last; replaced as a whole, so that another
+    thread counts no pause twice.
+
+    Args:
+        at: its time.
+        computed: the processor time of this process by then, in seconds.
+        stalls: the latest times in which the process stood still.
+    """
+
+    at: float
+    computed: float
+    stalls: tuple[tuple[float, float], ...]
+
+    def stalls_until(self, now: float) -> tuple[tuple[float, float], ...]:
+        """With the one that ends just now, which the watching thread may not have seen yet."""
+        lost = now - self.at - _POLL_S
+        busy = time.process_time() - self.computed
+        stalled = lost > _STALL_S and busy < _BUSY_SHARE * lost
+        return (*self.stalls, (now - lost, now)) if stalled else self.stalls
+
+
 class DelayMonitor:
     """Measures how long calls take, in any thread, and when this process stood still.
 
@@ -70,9 +94,7 @@ class DelayMonitor:
     def __init__(self) -> None:
         self._spans: deque[_Span] = deque(maxlen=1024)
         self._open: dict[int, tuple[DelaySource, float]] = {}
-        self._stalls: deque[tuple[float, float]] = deque(maxlen=32)
-        # When the watching thread looked last, and the processor time of this process by then.
-        self._looked: tuple[float, float] | None = None
+        self._look: _Look | None = None
 
     @contextmanager
     def of(self, source: DelaySource) -> Iterator[None]:
@@ -121,11 +143,11 @@ class DelayMonitor:
 
         def watch() -> None:
             warned: set[DelaySource] = set()
-            self._looked = time.monotonic(), time.process_time()
+            self._look = look = _Look(time.monotonic(), time.process_time(), ())
             while not ended.wait(_POLL_S):
                 now = time.monotonic()
-                self._stalls.extend(self._stall(now))
-                self._looked = now, time.process_time()
+                stalls = look.stalls_until(now)[-_STALLS_KEPT:]
+                self._look = look = _Look(now, time.process_time(), stalls)
                 source, began = self._open.get(watched, (None, now))
                 if source is not None and source not in warned and now - began > after_s:
                     warned.add(source)
@@ -138,19 +160,11 @@ class DelayMonitor:
         finally:
             ended.set()
             thread.join()
-            self._looked = None
+            self._look = None
 
-    def _stalls_until(self, now: float) -> list[tuple[float, float]]:
-        # The one that ends just now may not have been seen by the watching thread yet.
-        return [*self._stalls, *self._stall(now)]
-
-    def _stall(self, now: float) -> list[tuple[float, float]]:
-        if self._looked is None:
-            return []
-        looked, computed = self._looked
-        lost = now - looked - _POLL_S
-        busy = time.process_time() - computed
-        return [(now - lost, now)] if lost > _STALL_S and busy < _BUSY_SHARE * lost else []
+    def _stalls_until(self, now: float) -> tuple[tuple[float, float], ...]:
+        look = self._look
+        return () if look is None else look.stalls_until(now)
 
 
 def _overlap(a: float, b: float, c: float, d: float) -> float:

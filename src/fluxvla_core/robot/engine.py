@@ -175,6 +175,11 @@ class LocalEngine(Engine):
         if self._holding is not None:
             self._holding.hold()
 
+    def stop_held(self, error: FluxError) -> None:
+        """Stop the arm that is held, because of ``error``: see ``Episode.stop_held``."""
+        if self._holding is not None:
+            self._holding.stop_held(error)
+
     def release(self) -> None:
         self._holding = None
 

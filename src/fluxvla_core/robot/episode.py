@@ -225,8 +225,16 @@ class Episode:
             self.resend()
         except FluxError as error:
             self._note_stall(error)
-            self._stop_held(error)
+            self.stop_held(error)
             raise
+
+    def stop_held(self, error: FluxError) -> None:
+        """Trip the latch because of ``error``, and stop the arm that is held."""
+        latch = self._latch
+        if latch.tripped is None:
+            latch.trip(self._rule(error), error)
+        failure = self._stop_robot()
+        self._emit(StoppedWhileHeld(self._robot.clock.now(), latch.trips[-1], failure))
 
     def resend(self) -> None:
         """As ``hold``, but on an error the caller has to stop the robot."""
@@ -365,13 +373,6 @@ class Episode:
         if failure:
             self._parts.reporter.warn(failure)
         return failure
-
-    def _stop_held(self, error: FluxError) -> None:
-        latch = self._latch
-        if latch.tripped is None:
-            latch.trip(self._rule(error), error)
-        failure = self._stop_robot()
-        self._emit(StoppedWhileHeld(self._robot.clock.now(), latch.trips[-1], failure))
 
     def _end(self, outcome: str, problem: str | None) -> None:
         success: bool | None

@@ -200,6 +200,7 @@ def memory_of(
     """
     options = runner.options
     by_dtypes: dict[tuple[tuple[str, torch.dtype], ...], SavedActivations] = {}
+    by_shapes: dict[Any, int] = {}  # many processes hold the same as one
     footprints = {}
     for count in processes:
         layout = runner.memory_layout(model, count, device_type)
@@ -208,10 +209,14 @@ def memory_of(
             by_dtypes[lowered] = (
                 NO_ACTIVATIONS if batch is None else activations_of(model, layout, runner, batch)
             )
+        shapes = tuple(tuple((t.shape, t.dtype) for t in group) for group in layout.optimized)
+        if shapes not in by_shapes:
+            build = runner.optimizer_settings.build
+            by_shapes[shapes] = optimizer_bytes(build, layout.optimized)
         footprints[count] = footprint(
             layout,
             by_dtypes[lowered],
-            optimizer_bytes(runner.optimizer_settings.build, layout.optimized),
+            by_shapes[shapes],
             averaged=options.ema_decay is not None,
             recompute=options.enable_gradient_checkpointing,
         )

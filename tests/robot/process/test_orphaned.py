@@ -79,7 +79,7 @@ class HangingArm:
 
 def test_the_parent_of_later_is_not_the_main_process():
     memory = make_memory()
-    inbox = Inbox(Link(memory, control=True), SafetySettings(), main=os.getppid() + 1)
+    inbox = Inbox(Link(memory, control=True), SafetySettings(), main=os.getppid() + 1, rate_hz=50.0)
     os.close(memory)
     assert inbox.orphaned
     with pytest.raises(MainSilent, match="the main process was killed"):

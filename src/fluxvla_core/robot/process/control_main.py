@@ -168,7 +168,7 @@ def serve(link: Link, setup: ControlSetup, frame_channel: FrameChannel | None = 
         ConfigError, PluginError: the operator or a filter cannot be built.
     """
     reporter = LinkReporter(link)
-    inbox = Inbox(link, setup.settings.safety, setup.main)
+    inbox = Inbox(link, setup.settings.safety, setup.main, setup.settings.rate_hz)
     _take_signals(inbox)
     threading.Thread(target=_outlive_main, args=(inbox,), daemon=True).start()
     logging.getLogger().addHandler(LinkLog(link))
@@ -247,17 +247,28 @@ def _report_orphaned(
             print(f"fluxvla: the record is not complete: {lost}", file=sys.stderr)
 
 
-def _wait(link: Link, inbox: Inbox, engine: Engine) -> None:
+def _wait(link: Link, inbox: Inbox, engine: LocalEngine) -> None:
     """Hold the arm for a tick, or wait for an order."""
     if not engine.holding:
         time.sleep(_POLL_S)
         return
+    ending: FluxError | Interrupted
     try:
         inbox.check()
-        engine.hold()
-    except (FluxError, Interrupted) as error:
-        engine.release()
-        link.send(Kind.RELEASED, **error_fields(error))
+    except Interrupted as signal_:
+        engine.stop()
+        ending = signal_
+    except FluxError as error:
+        engine.stop_held(error)
+        ending = error
+    else:
+        try:
+            engine.hold()
+            return
+        except FluxError as error:  # the arm was stopped
+            ending = error
+    engine.release()
+    link.send(Kind.RELEASED, **error_fields(ending))
 
 
 def _carry_out(

@@ -10,7 +10,6 @@ import queue
 import subprocess
 import sys
 import threading
-import time
 
 from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.control.interrupt import Interrupts
@@ -18,7 +17,7 @@ from fluxvla_core.control.safety import Rule
 from fluxvla_core.errors import RunFailed, SafetyStop
 from fluxvla_core.robot.events import Phase
 from fluxvla_core.robot.process.frames import FrameMemory
-from fluxvla_core.robot.process.link import Link, make_memory
+from fluxvla_core.robot.process.link import Link, SilenceWatch, make_memory
 from fluxvla_core.robot.process.link_server import LinkServer
 from fluxvla_core.robot.process.messages import Kind, Message
 from fluxvla_core.robot.process.remote_operator import RemoteOperator
@@ -84,8 +83,7 @@ class ControlProcess:
         self.server = LinkServer(self.link, robot, interrupts)
         self.holding = self.ended = False
         self._lost = 0
-        # When it was looked at last, and since when it was without a pause.
-        self._looked = self._looking_since = time.monotonic()
+        self._silence = SilenceWatch(self.link, _PAUSED_S)
 
     @property
     def pid(self) -> int:
@@ -137,19 +135,10 @@ class ControlProcess:
             except subprocess.TimeoutExpired:
                 self._process.kill()
             raise self._gone("stopped responding to this process and was ended")
-        patience_s, silent_s = self._patience_s(), self._silent_s()
+        patience_s, silent_s = self._patience_s(), self._silence.silent_s()
         if code is None and patience_s is not None and silent_s > patience_s:
             self._process.kill()
             raise self._gone(f"did not run for {silent_s:.1f} s and was killed")
-
-    def _silent_s(self) -> float:
-        """How long it has not run while this process did: both stand still where the machine does,
-        and this one may be the first to go on."""
-        now = time.monotonic()
-        if now - self._looked > _PAUSED_S:
-            self._looking_since = now
-        self._looked = now
-        return min(self.link.silent_s(), now - self._looking_since)
 
     def _patience_s(self) -> float | None:
         """How long it may not run; None while it waits for the operator."""

@@ -14,8 +14,11 @@ from fluxvla_core.control.policy_client import Answer
 from fluxvla_core.control.safety import BadChunk, Rule, RuleStop, SafetySettings
 from fluxvla_core.errors import FluxError
 from fluxvla_core.robot.events import Phase
-from fluxvla_core.robot.process.link import Link
+from fluxvla_core.robot.process.link import Link, SilenceWatch
 from fluxvla_core.robot.process.messages import Kind, Message, error_of
+
+# Without a check for so long, and for so many ticks, this process was paused.
+_PAUSED_S, _PAUSED_TICKS = 0.1, 3.0
 
 
 @dataclass(frozen=True)
@@ -43,17 +46,20 @@ class Inbox(Interrupts):
         link: the control process's end.
         safety: how long the main process may be silent.
         main: the main process's id. This process may have another parent already.
+        rate_hz: how often ``check`` is called while the arm moves; fewer calls show that this
+            process was paused, perhaps with the whole machine.
 
     ``watch`` is called at every tick while the arm moves, and raises what is to stop it.
     """
 
-    def __init__(self, link: Link, safety: SafetySettings, main: int) -> None:
+    def __init__(self, link: Link, safety: SafetySettings, main: int, rate_hz: float) -> None:
         super().__init__()
         self.phase = Phase.OVER
         self.orders: deque[Message] = deque()
         self.answers: dict[int, Future[Answer]] = {}
         self.replies: dict[str, Message] = {}
         self._link = link
+        self._silence = SilenceWatch(link, max(_PAUSED_S, _PAUSED_TICKS / rate_hz))
         self._safety = safety
         self._main = main
         self._fault: FluxError | None = None
@@ -134,7 +140,7 @@ class Inbox(Interrupts):
             name, most = "silence_s", self._safety.silence_s
         else:
             name, most = "first_chunk_s", self._safety.first_chunk_s
-        silent = self._link.silent_s()
+        silent = self._silence.silent_s()
         if silent > most:
             raise MainSilent(
                 f"the main process did not run for {silent:.2f} s, safety.{name} is {most:g}",

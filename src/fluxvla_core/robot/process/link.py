@@ -109,3 +109,36 @@ class Link:
         """How many seconds the other process has not run; 0 before it ever did."""
         last = self._times[self._other]
         return (time.monotonic_ns() - last) * 1e-9 if last else 0.0
+
+
+class SilenceWatch:
+    """How long the other process has not run, as far as this one can blame it.
+
+    Where the whole machine stands still, neither process runs, and this one may be the first to
+    go on. So the longest pause of this one since the other ran is no silence. One pause only: a
+    driver that blocks at every tick must not hide that the other process is dead.
+
+    Args:
+        link: this process's end.
+        paused_s: two looks that are further apart show a pause.
+    """
+
+    def __init__(self, link: Link, paused_s: float) -> None:
+        self._link, self._paused_s = link, paused_s
+        self._looked = time.monotonic()
+        self._pause = (self._looked, self._looked)
+
+    def silent_s(self) -> float:
+        """Look: seconds for which the other process has not run, less a pause of this one."""
+        looked, self._looked = self._looked, time.monotonic()
+        silent = self._link.silent_s()
+        ran = self._looked - silent
+        if self._looked - looked > self._paused_s:
+            pauses = self._pause, (looked, self._looked)
+            self._pause = max(pauses, key=lambda pause: _since(ran, pause))
+        return max(silent - _since(ran, self._pause), 0.0)
+
+
+def _since(at: float, pause: tuple[float, float]) -> float:
+    """How many seconds of ``pause`` were after ``at``."""
+    return max(pause[1] - max(pause[0], at), 0.0)

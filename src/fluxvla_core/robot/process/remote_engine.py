@@ -288,7 +288,7 @@ class RemoteEngine(Engine):
                 self._reporter.artifact(fields["artifact"], Path(fields["path"]))
             case Kind.LOG:
                 logging.getLogger(fields["logger"]).log(fields["level"], "%s", fields["text"])
-            case Kind.RELEASED:
+            case Kind.RELEASED if self.holding:
                 self._let_go()
                 raise error_of(fields)
             case Kind.FAILED:

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 
@@ -33,18 +34,50 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 from tools import stages  # noqa: E402
+from tools.stalls import STALL_S, StallWatch  # noqa: E402
 
 # How long an example takes says something about the machine, not about the project.
 settings.register_profile("fluxvla", deadline=None)
 settings.load_profile("fluxvla")
 
 
+# Marks of tests with deadlines, and how often one is run again because of the machine.
+DEADLINES, RERUNS = ("network", "realtime"), 2
+
+
+class Stalled:
+    """Whether the machine stood still during the present attempt of a test."""
+
+    def __init__(self) -> None:
+        self.watch: StallWatch | None = None
+        self.began = 0.0
+
+    def begin(self) -> None:
+        if self.watch is None:
+            self.watch = StallWatch()
+        self.began = time.monotonic()
+
+    def __call__(self) -> bool:
+        return self.watch is not None and self.watch.longest_s(self.began) > STALL_S
+
+
+STALLED = Stalled()
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> Generator[None]:
-    """What opens a ROS network waits for other processes, which a busy machine keeps waiting."""
+def pytest_collection_modifyitems(
+    config: pytest.Config, items: list[pytest.Item]
+) -> Generator[None]:
+    """What opens a ROS network waits for other processes, which a busy machine keeps waiting.
+
+    Tests with deadlines are run again if they fail while the machine stands still.
+    """
+    reruns = config.pluginmanager.hasplugin("rerunfailures") and not config.option.usepdb
     for item in items:
         if "ros_domain" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.network)
+        if reruns and any(item.get_closest_marker(name) for name in DEADLINES):
+            item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=STALLED))
     yield  # others leave tests out here, by their marks
     if "PYTEST_XDIST_WORKER" in os.environ:
         begin_with_what_takes_long(items)
@@ -78,8 +111,23 @@ def pytest_deselected(items: Sequence[pytest.Item]) -> None:
         stages.note(Path(place), [(file, names) for file, names in marks if "slow" not in names])
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("flaky"):
+        STALLED.begin()
+
+
+def pytest_unconfigure() -> None:
+    if STALLED.watch is not None:
+        STALLED.watch.close()
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Note the skipped tests: a session lists those of all its stages at its end."""
+    """Show which tests the machine failed.
+
+    Note the skipped tests: a session lists those of all its stages at its end.
+    """
+    for report in terminalreporter.stats.get("rerun", []):
+        terminalreporter.write_line(f"run again, the machine stood still: {report.nodeid}")
     place = os.environ.get(stages.SKIPPED)
     if place and "PYTEST_XDIST_WORKER" not in os.environ:  # its controller counts what it skipped
         reports = terminalreporter.stats.get("skipped", [])

@@ -14,7 +14,7 @@ from fluxvla_core.cli.reporters import EVERY_S, heartbeat
 def slowly(*args: object, **kwargs: object) -> None:
     until = time.monotonic() + 20.0
     # capsys keeps what was said in memory, and readouterr would take it away.
-    while "since: " not in sys.stderr.getvalue():  # type: ignore[attr-defined]
+    while "since: " not in sys.stderr.getvalue():  # type: ignore[union-attr]
         assert time.monotonic() < until, "nothing was said"
         time.sleep(0.02)
     raise KeyboardInterrupt

@@ -420,7 +420,7 @@ def _store() -> Any:
     """
     listener = socket.create_server(("127.0.0.1", 0))
     port = listener.getsockname()[1]
-    return torch.distributed.TCPStore(
+    return torch.distributed.TCPStore(  # type: ignore[attr-defined]
         "127.0.0.1",
         port,
         is_master=True,

@@ -57,7 +57,7 @@ class ToyTrainRunner:
         if self.mode == "denied":
             raise DataError("bad data", where="a.mp4", next="look at it")
         if self.mode == "silent":
-            time.sleep(0.5)
+            time.sleep(1.5)
         if self.mode == "hints":
             text = "--set <section>.mode=a, --set <ToyDataset>.size=2 or --set <Gone>.size=2"
             raise DataError("bad data", next=text)

@@ -70,15 +70,18 @@ def test_what_is_wrong_with_a_machine() -> None:
 
 
 @pytest.mark.parametrize(
-    ("program", "error"),
+    ("program", "seconds", "error"),
     [
-        ("import time; time.sleep(60)", "its import did not end in 1 s"),
+        ("import time; time.sleep(60)", 1.0, "its import did not end in 1 s"),
         (
             "import os, signal; os.kill(os.getpid(), signal.SIGKILL)",
+            60.0,
             "its import fails: exit status -9",
         ),
-        ("raise ImportError('libcudart')", "its import fails: ImportError: libcudart"),
+        ("raise ImportError('libcudart')", 60.0, "its import fails: ImportError: libcudart"),
     ],
 )
-def test_an_import_that_breaks_its_process_is_an_answer(program: str, error: str) -> None:
-    assert machine._asked(program, 1.0) == {"error": error}
+def test_an_import_that_breaks_its_process_is_an_answer(
+    program: str, seconds: float, error: str
+) -> None:
+    assert machine._asked(program, seconds) == {"error": error}

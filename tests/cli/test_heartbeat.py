@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 import pytest
@@ -11,7 +12,11 @@ from fluxvla_core.cli.reporters import EVERY_S, heartbeat
 
 
 def slowly(*args: object, **kwargs: object) -> None:
-    time.sleep(0.5)
+    until = time.monotonic() + 20.0
+    # capsys keeps what was said in memory, and readouterr would take it away.
+    while "since: " not in sys.stderr.getvalue():  # type: ignore[union-attr]
+        assert time.monotonic() < until, "nothing was said"
+        time.sleep(0.02)
     raise KeyboardInterrupt
 
 

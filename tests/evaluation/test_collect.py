@@ -203,7 +203,7 @@ def test_a_collection_that_is_silent_is_said_to_be_working(tmp_path, capsys, mon
 def test_ctrl_c_says_how_a_collection_goes_on(tmp_path):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "fluxvla_core", *words(out, "--workers", "1", episodes=6)]
-    command += ["--set", "env.slow=0.02"]
+    command += ["--set", "env.slow=0.06"]  # seconds are left of it after its first episode
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([*command, "--log-format", "json"], **pipes) as process:
         for line in process.stdout:

@@ -6,7 +6,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -119,10 +118,8 @@ def test_what_was_finished_before_kill_9_is_not_run_again(tmp_path, config):
 def test_torchruns_processes_share_an_evaluation(tmp_path, config):
     pytest.importorskip("torch")
     whole(config, tmp_path / "whole")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    launcher = ["--nproc-per-node", "2", "--master-addr", "127.0.0.1", "--master-port", str(port)]
+    # It takes a port by itself: one that is found free here may be taken by then.
+    launcher = ["--nproc-per-node", "2", "--standalone", "--local-addr", "127.0.0.1"]
     ended = subprocess.run(
         [sys.executable, "-m", "torch.distributed.run", *launcher, "-m", "fluxvla_core"]
         + words(config, tmp_path / "two", "--set", "eval.workers+=1"),

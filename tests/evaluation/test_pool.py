@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import time
 
 import pytest
 
 from fluxvla_core.errors import ConfigError, RunFailed, SpecMismatch
+from fluxvla_core.evaluation import pool
 from fluxvla_core.evaluation.pool import WorkerPool
 from fluxvla_core.plugins.registry import load_plugin_files
 from tests.evaluation import workers
@@ -20,8 +22,8 @@ def no_process_is_left():
 
 
 def outcomes(factory, jobs, processes=2, **options):
-    with WorkerPool(factory, processes, **options) as pool:
-        return sorted(pool.run(jobs), key=lambda o: o.index)
+    with WorkerPool(factory, processes, **options) as running:
+        return sorted(running.run(jobs), key=lambda o: o.index)
 
 
 @pytest.mark.parametrize("processes", [1, 3])
@@ -93,9 +95,25 @@ def test_a_failure_of_the_run_is_an_error_of_its_job_alone(tmp_path):
 
 def test_a_hanging_job_is_ended_and_retried(tmp_path):
     jobs = ["hangonce", "hang", "fine"]
-    found = outcomes(workers.Recorder(str(tmp_path)), jobs, timeout_s=1.5)
+    found = outcomes(workers.Recorder(str(tmp_path)), jobs, timeout_s=3.0)
     assert [o.result for o in found] == ["hangonce done", None, "fine done"]
-    assert found[1].error == "took longer than 1.5 s"
+    assert found[1].error == "took longer than 3 s"
+
+
+def test_an_answer_that_came_while_this_process_stood_still_is_in_time(monkeypatch):
+    wait = pool.wait
+
+    def stands_still(connections, timeout):
+        """Nothing is readable when the time is over, and an answer is there a moment later."""
+        if timeout is None:
+            return wait(connections)
+        assert wait(connections, 60)
+        time.sleep(timeout)
+        return []
+
+    monkeypatch.setattr(pool, "wait", stands_still)
+    (found,) = outcomes(workers.square, [3], 1, timeout_s=0.2)
+    assert (found.result, found.attempts) == (9, 1)
 
 
 def test_bad_input_ends_the_run_with_its_own_message(tmp_path):

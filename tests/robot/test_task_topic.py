@@ -14,6 +14,8 @@ from fluxvla_core.testing.ros2 import ros_domain
 
 __all__ = ["ros_domain"]
 TOPIC = "/arm/task"
+# Three seconds of a task: time to say something meanwhile.
+STEPS = 150
 
 
 class Somebody:
@@ -56,7 +58,7 @@ def somebody(ros_domain):
 
 def test_tasks_that_are_said_are_done(somebody, bench, make_arm):
     bench.arm = make_arm(realtime=True)
-    runner = bench.runner(task=None, task_topic=TOPIC, max_publish_step=20)
+    runner = bench.runner(task=None, task_topic=TOPIC, max_publish_step=STEPS)
     runner.run_setup()
     ended = []
 
@@ -73,7 +75,7 @@ def test_tasks_that_are_said_are_done(somebody, bench, make_arm):
             while not bench.arm.sent:
                 time.sleep(0.01)
             somebody.say("stir the soup")
-            somebody.hears("2: max_steps, no success, 20 commands")
+            somebody.hears(f"2: max_steps, no success, {STEPS} commands")
             somebody.hears("refused, the robot was busy: stir the soup")
             somebody.say("wave at the camera")
             while bench.policy.asked[-1]["task_description"] != "wave at the camera":

@@ -44,11 +44,13 @@ def lasting_robot(lasting_drivers):
 
 def settled(robot):
     """The last test's operator held its arm when it was closed; that too has arrived."""
-    before, until = None, time.monotonic() + 30.0
-    while len(robot.heard) != before:
-        assert time.monotonic() < until, f"commands still arrive: {before} by now"
+    before, looks, until = len(robot.heard), 0, time.monotonic() + 30.0
+    # Several looks: a machine that stands still delays commands too, and the time of one look.
+    while looks < 10:
+        time.sleep(0.03)
+        looks = looks + 1 if len(robot.heard) == before else 0
         before = len(robot.heard)
-        time.sleep(0.15)
+        assert looks or time.monotonic() < until, f"commands still arrive: {before} by now"
 
 
 def commanded(arm, robot, action):
@@ -267,6 +269,13 @@ class TestCommanding:
 
 
 class TestFaults:
+    @pytest.fixture
+    def arm(self, operators, robot):
+        """One that allows the half second of silence that a robot's operator does."""
+        operator = operators(max_age_s=0.5)
+        operator.connect()
+        return operator
+
     def test_a_camera_that_falls_silent_is_named(self, arm, robot):
         robot.tell(fault="/cam/image=drop")
         error = frame_error(arm, "cam (/cam/image) is silent for ")
@@ -277,10 +286,9 @@ class TestFaults:
     def test_reading_the_state_alone_notices_a_silent_camera_too(self, arm, robot):
         """The loop reads it after each command, and frames only when a policy is asked."""
         robot.tell(fault="/cam/image=drop")
-        time.sleep(0.7)
+        error = frame_error(arm, "cam (/cam/image) is silent", call=arm.get_state)
 
-        with pytest.raises(Stale, match=r"cam \(/cam/image\) is silent"):
-            arm.get_state()
+        assert isinstance(error, Stale)
 
     def test_a_camera_that_repeats_its_last_image_is_silent_too(self, arm, robot):
         robot.tell(fault="/cam/image=freeze")

@@ -139,14 +139,14 @@ def test_stop_does_not_wait_for_a_connection_that_does_not_come(operators):
         with pytest.raises(NotReady):
             call()
 
-    operator = operators(connect_timeout_s=1.2)
+    operator = operators(connect_timeout_s=4.0)
     connecting = threading.Thread(target=fails, args=[operator.connect])
     connecting.start()
     time.sleep(0.3)
     before = time.monotonic()
     operator.stop()
 
-    assert time.monotonic() - before < 1.0
+    assert time.monotonic() - before < 3.0
     assert connecting.is_alive()
     connecting.join(10.0)
     assert not connecting.is_alive()

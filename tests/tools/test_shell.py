@@ -55,8 +55,9 @@ def test_what_is_said_to_this_python_does_not_reach_the_child(
 def test_ctrl_c_lets_the_child_finish_what_it_must(tmp_path: Path) -> None:
     child = textwrap.dedent("""
         import pathlib, sys, time
-        pathlib.Path("started").touch()
+        time.sleep(0.5)  # the parent may not wait for it yet
         try:
+            pathlib.Path("started").touch()
             time.sleep(60)
         except KeyboardInterrupt:
             time.sleep(0.5)
@@ -76,7 +77,8 @@ def test_ctrl_c_lets_the_child_finish_what_it_must(tmp_path: Path) -> None:
         start_new_session=True,
     )
     deadline = time.monotonic() + 30
-    while not (tmp_path / "started").exists() and time.monotonic() < deadline:
+    while not (tmp_path / "started").exists():
+        assert time.monotonic() < deadline, "the child did not start"
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=30) == 7

@@ -18,7 +18,7 @@ training = pytest.importorskip("fluxvla_core.testing.training")
 
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "aloha_sim_transfer.py"
 SMALL = (
-    *("train_dataloader.per_device_batch_size=4", "runner.max_steps=12"),
+    *("train_dataloader.per_device_batch_size=4", "runner.max_steps=30"),
     "runner.save_iter_interval=3",
 )
 
@@ -40,7 +40,7 @@ def start(dataset: Path, work: Path, *more: str) -> subprocess.Popen[str]:
 
 
 def finish(process: subprocess.Popen[str]) -> str:
-    said, _ = process.communicate(timeout=300)
+    said, _ = process.communicate(timeout=900)
     assert process.returncode == 0, said
     return said
 
@@ -57,6 +57,6 @@ def test_the_demo_killed_and_resumed_equals_one_that_was_not(tmp_path):
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL
-    assert not (cut / "checkpoints" / "step-000000012").exists()
+    assert not (cut / "checkpoints" / "step-000000030").exists()
     assert "resum" in finish(start(dataset, cut, "--resume", "auto"))
     assert training.differences(whole, cut) == []

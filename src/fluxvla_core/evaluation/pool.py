@@ -180,9 +180,11 @@ class WorkerPool:
         readable = wait([w.connection for w in self._workers], timeout=self._patience())
         ended = []
         for worker in list(self._workers):
-            if worker.connection in readable:
+            late = worker.deadline is not None and time.monotonic() > worker.deadline
+            # An answer may have come since: what kept this process may have kept it too long.
+            if worker.connection in readable or (late and worker.connection.poll()):
                 outcome = self._receive(worker)
-            elif worker.deadline is not None and time.monotonic() > worker.deadline:
+            elif late:
                 outcome = self._lost(worker, f"took longer than {self._timeout_s:g} s")
             else:
                 continue

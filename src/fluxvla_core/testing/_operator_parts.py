@@ -16,8 +16,9 @@ from fluxvla_core.plugins.registry import OPERATORS
 from fluxvla_core.spec import EmbodimentSpec
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
-# No command in this time means that no more are under way.
-_QUIET_S = 0.3
+# No command in this time means that no more are under way. It passes in so many looks, because a
+# machine that stands still delays commands too, and the time of one look at most.
+_QUIET_S, _LOOKS = 0.5, 10
 # How far a joint of an arm at rest may be read apart by two who read it at different times, and how
 # far one is commanded to see whether it moves, in its unit: small enough for any servo.
 _APART, STEP = 0.01, 0.03
@@ -96,17 +97,25 @@ class DividedOperatorChecks:
     def settled(self, operator: Any) -> int | None:
         """``commands_heard`` once no more come; fails if they continue for ``ready_within_s``."""
         deadline = time.monotonic() + self.ready_within_s
-        heard = self.commands_heard(operator)
-        while heard is not None:
-            time.sleep(_QUIET_S)
+        heard, looks = self.commands_heard(operator), 0
+        while heard is not None and looks < _LOOKS:
+            time.sleep(_QUIET_S / _LOOKS)
             before, heard = heard, self.commands_heard(operator)
-            if heard == before:
-                break
-            assert time.monotonic() < deadline, (
+            looks = looks + 1 if heard == before else 0
+            assert looks or time.monotonic() < deadline, (
                 f"commands still arrive after {self.ready_within_s:g} s without a send_action, "
                 f"{heard} by now: what sends them does not end"
             )
         return heard
+
+    def _hears_more(self, operator: Any, than: int) -> bool:
+        """Wait until ``commands_heard`` is more than that; a command may be under way for long."""
+        deadline = time.monotonic() + self.ready_within_s
+        while (heard := self.commands_heard(operator)) is not None and heard <= than:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
+        return True
 
     def test_both_parts_read_the_robot_at_the_same_time(self, parts: tuple[Any, Any]) -> None:
         control, cameras = parts
@@ -166,7 +175,10 @@ class DividedOperatorChecks:
         self._connect(parts)
         # So that there is a command to repeat, if only by mistake.
         held = self._held(control.embodiment, self._state(control))
+        earlier = self.commands_heard(cameras)
         control.send_action(held)
+        if earlier is not None:
+            self._hears_more(cameras, earlier)
         before = self.settled(cameras)
         assert self._refused(lambda: cameras.send_action(held), Rejected), (
             "send_action() of the part without commands took a command, expected Rejected: "

@@ -370,7 +370,8 @@ def run_ranks(
     context = multiprocessing.get_context("forkserver")
     # Slow to import, so only for those who use it.
     context.set_forkserver_preload([*PRELOAD, *(n for n in ("peft",) if n in sys.modules)])
-    port = _free_port() if ranks > 1 else 0
+    store = _store() if ranks > 1 else None  # kept until all have ended
+    port = 0 if store is None else store.port
     processes = [
         context.Process(target=_rank, args=(rank, ranks, port, usual, function, args))
         for rank in range(ranks)
@@ -407,12 +408,22 @@ def _rank(
             LOCAL_WORLD_SIZE=str(ranks),
             MASTER_ADDR="127.0.0.1",
             MASTER_PORT=str(port),
+            TORCHELASTIC_USE_AGENT_STORE=str(True),
         )
     function(*args)
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+def _store() -> Any:
+    """The store by which the ranks find each other, as torch's own agent has it for its ranks.
+
+    A port that is only found to be free may be another program's by the time rank 0 listens at it.
+    """
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    return torch.distributed.TCPStore(  # type: ignore[attr-defined]
+        "127.0.0.1",
+        port,
+        is_master=True,
+        wait_for_workers=False,
+        master_listen_fd=listener.detach(),
+    )

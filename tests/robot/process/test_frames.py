@@ -273,8 +273,8 @@ def test_who_waits_for_a_frame_gives_up_when_the_control_process_is_gone():
     began = time.monotonic()
     operator.close()
 
-    thread.join(10)
-    assert time.monotonic() - began < 1.0
+    thread.join(20)
+    assert time.monotonic() - began < 5.0
     assert "does not run" in str(found)
     # The next process has memory of its own.
     answering(operator, [message_of_frame(frame(3), NAMES, "a")])

@@ -119,17 +119,18 @@ def test_one_that_takes_longer_is_left_out_reported_once_and_counted(told):
     inner = Add()
     timed = told.timed(inner)
 
-    for seconds in (0.05, 0.5):
-        inner.wait = lambda: time.sleep(seconds)  # noqa: B023 - called in this round
+    for _ in range(2):
+        # Kept until it was given up: one that only sleeps may end first on a machine that stalls.
+        inner.wait = gate = Gate()
         timed._share_s, began = 0.005, time.monotonic()
         np.testing.assert_array_equal(timed(POSE), POSE)
-        took = time.monotonic() - began
+        assert time.monotonic() - began < PATIENT_S
+        gate.open()
         # By the next command it is done, and in time: what it made for this one is dropped.
         until(lambda: not timed._results.empty())
         inner.wait, timed._share_s = (lambda: None), PATIENT_S
         np.testing.assert_array_equal(timed(POSE * 2), POSE * 2 + 1)
 
-    assert took < 0.4
     assert told.left_out == ["Add"] * 2
     assert told.warnings == [
         "action filter Add did not return within 5 ms and was left out of a command"
@@ -148,7 +149,7 @@ def test_one_that_hangs_is_given_nothing_more_and_ends_the_motion(told, gate):
 
     assert rule_of(caught.value) == "filter"
     # While the thread is busy, nobody waits for it.
-    assert time.monotonic() - began < 1.0
+    assert time.monotonic() - began < PATIENT_S
     assert len(inner.given) == 1
     assert told.left_out == ["Add"] * MOST_LATE
     assert len(told.warnings) == 1

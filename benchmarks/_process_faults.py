@@ -368,7 +368,7 @@ def _environment(pid: int) -> bytes:
 
 
 MAIN = "main process"
-LOCKED = r"the main process did not run for 0\.\d+ s"
+LOCKED = r"the main process did not run for \d\.\d+ s"
 MAIN_KILLED = "fluxvla: the main process was killed"
 FROZEN = rf"{MAIN_KILLED} \(before that: the main process did not run for 2\.\d+ s.*"
 KILLED = f"{MAIN_KILLED}; the robot was stopped"

@@ -25,7 +25,7 @@ def test_a_get_frame_that_blocks_in_motion_is_not_the_policys_doing(bench, make_
     error = fails(
         bench,
         SafetyStop,
-        r"safety.starvation_s is 0.3: Arm\.get_frame\(\) took 0\.[23]\d s of that",
+        r"safety.starvation_s is 0.3: Arm\.get_frame\(\) took \d\.\d+ s of that",
         async_execution=asynchronous,
         max_publish_step=500,
         safety={"starvation_s": 0.3},
@@ -47,7 +47,7 @@ def test_a_get_frame_that_blocks_in_a_simulation_is_told(bench):
     assert bench.run(safety={"starvation_s": 0.2})["outcome"] == "max_steps"
 
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert "Arm.get_frame() has not returned for 0." in line
+    assert re.search(r"Arm\.get_frame\(\) has not returned for \d\.\d s", line)
 
 
 def test_a_get_frame_that_takes_too_long_in_a_simulation(bench):
@@ -56,7 +56,7 @@ def test_a_get_frame_that_takes_too_long_in_a_simulation(bench):
     fails(
         bench,
         SafetyStop,
-        r"no chunk within 0.2 s: Arm\.get_frame\(\) took 0\.3\d s of that",
+        r"no chunk within 0.2 s: Arm\.get_frame\(\) took \d\.\d+ s of that",
         safety={"first_chunk_s": 0.2},
     )
     assert_stopped(bench, "starvation", "Arm.get_frame()")
@@ -76,8 +76,8 @@ def test_a_get_frame_that_returns_late_says_which_stream_came_last(bench, make_a
 
     bench.arm.get_frame = late
 
-    error = fails(bench, SafetyStop, r"streams state and front are 0\.4\d s apart")
-    assert re.match(r"Arm\.get_frame\(\) took 0\.4\d s; front came last in it", error.cause)
+    error = fails(bench, SafetyStop, r"streams state and front are \d\.\d+ s apart")
+    assert re.match(r"Arm\.get_frame\(\) took \d\.\d+ s; front came last in it", error.cause)
 
 
 @pytest.mark.realtime
@@ -95,7 +95,7 @@ def test_a_process_that_stood_still_blames_neither_the_policy_nor_a_stream(bench
     fails(
         bench,
         SafetyStop,
-        r"safety.starvation_s is 0.3: this machine took 0\.\d+ s of that",
+        r"safety.starvation_s is 0.3: this machine took \d\.\d+ s of that",
         max_publish_step=500,
         safety={"starvation_s": 0.3},
     )
@@ -127,14 +127,14 @@ def test_a_send_action_that_blocks_is_told(bench, make_arm):
     bench.run(safety={"starvation_s": 0.2})
 
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert "Arm.send_action() has not returned for 0." in line
+    assert re.search(r"Arm\.send_action\(\) has not returned for \d\.\d s", line)
 
 
 @pytest.mark.realtime
 def test_an_operator_whose_stop_hangs_does_not_hang_the_run(bench, make_arm, monkeypatch):
     monkeypatch.setattr("fluxvla_core.robot.robot.STOP_S", 0.1)
     bench.arm = make_arm(realtime=True)
-    bench.arm.faults = {"stop": lambda: time.sleep(1)}
+    bench.arm.faults = {"stop": lambda: time.sleep(3)}
 
     bench.run(max_publish_step=5)
 
@@ -142,6 +142,7 @@ def test_an_operator_whose_stop_hangs_does_not_hang_the_run(bench, make_arm, mon
     assert "Arm.stop did not return within 0.1 s: use the robot's emergency stop" in line
 
 
+@pytest.mark.realtime
 def test_a_robot_whose_get_frame_hangs(bench, make_arm):
     bench.arm = make_arm(realtime=True)
     bench.arm.faults["get_frame"] = lambda: time.sleep(2)

@@ -194,6 +194,7 @@ def test_it_ends_in_a_stop_that_says_why(tmp_path: Path, capsys, arms, name: str
     assert stop["rule"] == fault.rule
 
 
+@pytest.mark.realtime
 def test_a_stepped_wall_clock_changes_nothing(bench, make_arm, monkeypatch):
     """NTP or a person sets the clock, days to and fro, at every look at it."""
     bench.arm = make_arm(realtime=True)

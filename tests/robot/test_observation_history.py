@@ -74,6 +74,7 @@ def test_in_lockstep_it_is_a_queue_that_is_filled_at_every_action(bench, looking
 
 
 @pytest.mark.parametrize("method", ["synchronous", "latest_only"])
+@pytest.mark.realtime
 def test_an_arm_in_real_time_is_looked_at_between_two_questions(bench, make_arm, method):
     bench.arm = make_arm(realtime=True)
     bench.policy = looking = Looking(bench.policy)
@@ -88,6 +89,7 @@ def test_an_arm_in_real_time_is_looked_at_between_two_questions(bench, make_arm,
 
 
 @pytest.mark.parametrize("thinks_s", [0.0, 0.15])
+@pytest.mark.realtime
 def test_what_it_saw_in_real_time_is_recorded_and_can_be_shown_again(bench, make_arm, thinks_s):
     pytest.importorskip("rosbags")
     bench.arm = make_arm(realtime=True)
@@ -109,6 +111,7 @@ def test_what_it_saw_in_real_time_is_recorded_and_can_be_shown_again(bench, make
     assert {step for steps in looking.seen for step in steps} <= recorded
 
 
+@pytest.mark.realtime
 def test_a_policy_that_thinks_all_the_time_waits_for_what_it_needs(bench, make_arm):
     """Asked again as soon as it has answered, it has seen nothing of the time in between."""
     bench.arm = make_arm(realtime=True)
@@ -120,6 +123,7 @@ def test_a_policy_that_thinks_all_the_time_waits_for_what_it_needs(bench, make_a
         assert [last - step for step in before] == pytest.approx([10, 5], abs=4)
 
 
+@pytest.mark.realtime
 def test_a_robot_that_cannot_be_read_that_often_is_refused(bench, make_arm):
     bench.arm = make_arm(realtime=True)
     bench.arm.faults |= {"get_frame": lambda: time.sleep(0.4), "after": 5}

@@ -97,7 +97,7 @@ def test_a_policy_that_hangs_on_a_robot(bench, make_arm, asynchronous):
     fails(
         bench,
         SafetyStop,
-        r"waits for a chunk for \d\.\d+ s, safety.starvation_s is 0.3: the policy took 0\.3",
+        r"waits for a chunk for \d\.\d+ s, safety.starvation_s is 0.3: the policy took \d\.\d+ s",
         async_execution=asynchronous,
         max_publish_step=500,
         safety={"starvation_s": 0.3},
@@ -114,7 +114,7 @@ def test_a_policy_that_hangs_in_a_simulation(bench):
     fails(
         bench,
         SafetyStop,
-        r"there was no chunk within 0.2 s: the policy took 0\.\d+ s of that",
+        r"there was no chunk within 0.2 s: the policy took \d\.\d+ s of that",
         safety={"first_chunk_s": 0.2},
     )
     assert_stopped(bench, "starvation", "no chunk")
@@ -131,6 +131,7 @@ def test_a_policy_that_raises_in_reset(bench):
     assert bench.arm.sent == []
 
 
+@pytest.mark.realtime
 def test_motion_does_not_begin_with_an_answer_that_took_long(bench, make_arm):
     """The second may, too: libraries compile more than once, and servers pause."""
     bench.arm = make_arm(realtime=True)
@@ -147,6 +148,7 @@ def test_motion_does_not_begin_with_an_answer_that_took_long(bench, make_arm):
     assert first["ms"]["policy"] < 300
 
 
+@pytest.mark.realtime
 def test_a_policy_that_is_slow_for_good_is_not_asked_for_ever(bench, make_arm):
     """Long chunks may make up for it; where they do not, starvation says so."""
     bench.arm = make_arm(realtime=True)

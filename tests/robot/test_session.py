@@ -76,6 +76,7 @@ def test_a_simulation_whose_time_stands_still_stands_still_between_tasks(bench, 
     assert len(bench.arm.sent) == steps
 
 
+@pytest.mark.realtime
 def test_between_two_tasks_the_last_command_is_sent_again_at_every_beat(bench, make_arm, asked):
     bench.arm = make_arm(realtime=True)
     asked(Slow("1", "2", polls=30))
@@ -89,6 +90,7 @@ def test_between_two_tasks_the_last_command_is_sent_again_at_every_beat(bench, m
     bench.assert_within_limits()
 
 
+@pytest.mark.realtime
 def test_nothing_is_sent_before_the_first_task(bench, make_arm, asked):
     bench.arm = make_arm(realtime=True)
     sent = []
@@ -104,6 +106,7 @@ def test_nothing_is_sent_before_the_first_task(bench, make_arm, asked):
     assert sent[:11] == [0] * 11
 
 
+@pytest.mark.realtime
 def test_an_arm_that_fails_while_it_is_held_stops_the_run(bench, make_arm, asked):
     bench.arm = make_arm(realtime=True)
     asked(Slow("1", "2", polls=60))
@@ -115,6 +118,7 @@ def test_an_arm_that_fails_while_it_is_held_stops_the_run(bench, make_arm, asked
     assert bench.episode("001-1")["outcome"] == "max_steps"
 
 
+@pytest.mark.realtime
 def test_what_stops_an_arm_between_two_tasks_is_recorded_with_the_one_before(
     bench, make_arm, asked
 ):
@@ -135,6 +139,7 @@ def test_what_stops_an_arm_between_two_tasks_is_recorded_with_the_one_before(
     assert bench.episode("001-1")["trips"] == []
 
 
+@pytest.mark.realtime
 def test_a_trip_that_cannot_be_recorded_is_said_and_stops_all_the_same(
     bench, make_arm, asked, monkeypatch
 ):
@@ -149,6 +154,7 @@ def test_a_trip_that_cannot_be_recorded_is_said_and_stops_all_the_same(
     assert bench.arm.calls[-2:] == ["stop", "close"]
 
 
+@pytest.mark.realtime
 def test_after_a_stop_nothing_moves_until_the_word_is_said(bench, make_arm, asked):
     bench.arm = make_arm(realtime=True)
     bench.policy.faults[2] = nan
@@ -202,6 +208,7 @@ def test_a_robot_that_failed_ends_the_run_whoever_asks(bench, asked):
     assert bench.arm.calls[-1] == "close"
 
 
+@pytest.mark.realtime
 def test_a_policy_that_still_thinks_is_not_asked_again(bench, make_arm, asked):
     bench.arm = make_arm(realtime=True)
     asked(Person("1", "rearm", "1"))
@@ -260,6 +267,7 @@ class Impatient(Person):
     ],
 )
 @pytest.mark.parametrize("lines", [(), ("1",)], ids=["at once", "while held"])
+@pytest.mark.realtime
 def test_a_signal_while_nobody_moves_the_arm_ends_the_run(
     bench, make_arm, asked, lines, number, error, said
 ):

@@ -201,6 +201,7 @@ def test_a_robot_has_a_latency_of_its_own(bench, make_arm):
     )
 
 
+@pytest.mark.realtime
 def test_a_slower_rate_is_allowed_on_a_robot(bench, make_arm):
     bench.arm = make_arm(realtime=True)
 

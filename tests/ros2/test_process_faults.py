@@ -11,6 +11,7 @@ import os
 import re
 import signal
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 
 import numpy as np
@@ -168,7 +169,9 @@ def test_a_main_process_that_is_killed_after_it_was_frozen(stage, tmp_path):
             assert time.monotonic() < until, running.said
             time.sleep(0.01)
         said = running.said
-    silent = r"\(before that: the main process did not run for 0\.\d+ s, safety.silence_s is 0\.2\)"
+    silent = (
+        r"\(before that: the main process did not run for \d\.\d+ s, safety.silence_s is 0\.2\)"
+    )
     assert re.search(rf"was killed {silent}; the robot was stopped", said), said
     (folder,) = (tmp_path / "inference").glob("*")
     recorded = open_recording(folder)
@@ -193,7 +196,8 @@ def test_a_machine_that_stands_still_is_no_hung_control_process(stage, tmp_path)
         time.sleep(0.3)
         os.kill(control, signal.SIGCONT)
         time.sleep(1.0)
-        running.type("\x03")
+        with suppress(OSError):  # it may have ended
+            running.type("\x03")
         running.wait_for(lambda: False, "the end", END_S)
         said = running.said
     assert "nothing commands the robot any more" not in said

@@ -73,7 +73,7 @@ def test_such_an_arm_is_held_when_the_policy_keeps_the_interpreter(tmp_path, mod
         return answer(observation)
 
     run.policy.thinks_s, run.policy.predict_action = 0.0, keep
-    with pytest.raises(SafetyStop, match=r"the main process did not run for 0\.\d+ s"):
+    with pytest.raises(SafetyStop, match=r"the main process did not run for \d\.\d+ s"):
         run.runner.run()
 
     assert [trip["rule"] for trip in run.episode["trips"]] == ["main process"]

@@ -72,13 +72,14 @@ def pytest_collection_modifyitems(
 
     Tests with deadlines are run again if they fail while the machine stands still.
     """
-    reruns = config.pluginmanager.hasplugin("rerunfailures") and not config.option.usepdb
     for item in items:
         if "ros_domain" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.network)
-        if reruns and any(item.get_closest_marker(name) for name in DEADLINES):
-            item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=STALLED))
     yield  # others leave tests out here, by their marks
+    if config.pluginmanager.hasplugin("rerunfailures") and not config.option.usepdb:
+        for item in items:
+            if any(item.get_closest_marker(name) for name in DEADLINES):
+                item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=STALLED))
     if "PYTEST_XDIST_WORKER" in os.environ:
         begin_with_what_takes_long(items)
 

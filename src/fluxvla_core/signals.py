@@ -69,14 +69,7 @@ def held_back(start_method: str) -> Iterator[None]:
 
         # It would start with the first process, and unblock the signals.
         resource_tracker.ensure_running()
-    with blocked(requests_to_stop()):
-        yield
-
-
-@contextmanager
-def blocked(numbers: Iterable[int]) -> Iterator[None]:
-    """Block these signals in this thread inside; those that came meanwhile are handled after."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, requests_to_stop())
     try:
         yield
     finally:
@@ -84,7 +77,7 @@ def blocked(numbers: Iterable[int]) -> Iterator[None]:
 
 
 def ignore(numbers: Iterable[int]) -> None:
-    """Ignore these signals from now on, also those that are blocked and pending.
+    """Ignore these signals from now on, also after a ``handling`` that this is called in.
 
     Only the main thread can set handlers: in another one nothing changes.
     """
@@ -95,7 +88,8 @@ def ignore(numbers: Iterable[int]) -> None:
 
 @contextmanager
 def handling(handler: Handler, *numbers: int) -> Iterator[None]:
-    """Handle these signals with ``handler`` inside; the previous handlers are restored.
+    """Handle these signals with ``handler`` inside; the previous handlers are restored, except
+    those of signals that are ignored by then.
 
     Only the main thread can set handlers: in another one nothing changes.
     """
@@ -107,4 +101,5 @@ def handling(handler: Handler, *numbers: int) -> Iterator[None]:
         yield
     finally:
         for number, before in previous.items():
-            signal.signal(number, before)
+            if signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, before)

@@ -8,7 +8,6 @@ import signal
 from collections.abc import Iterator, Mapping
 from contextlib import (
     AbstractContextManager,
-    ExitStack,
     closing,
     contextmanager,
     nullcontext,
@@ -23,7 +22,7 @@ from fluxvla_core.cli.plan import Plan
 from fluxvla_core.config.load import CONFIG_FILE
 from fluxvla_core.contracts.runner import Reporter
 from fluxvla_core.errors import RunFailed
-from fluxvla_core.signals import blocked, handling, ignore, requests_to_stop
+from fluxvla_core.signals import handling, ignore, requests_to_stop
 
 
 def execute(plan: Plan, args: argparse.Namespace) -> int:
@@ -206,18 +205,13 @@ def stopped_by_signals() -> Iterator[None]:
         raise _Terminated(number)
 
     numbers = requests_to_stop()
-    handled = ExitStack()
-    handled.enter_context(handling(handle, *(n for n in numbers if n != signal.SIGINT)))
     try:
-        with handled:
+        with handling(handle, *(n for n in numbers if n != signal.SIGINT)):
             try:
                 yield
             except BaseException:
                 if ranks.has_agent():
-                    # Blocked, so that none is handled, or ends the process, in between.
-                    with blocked(numbers):
-                        handled.close()
-                        ignore(numbers)
+                    ignore(numbers)
                 raise
     except _Terminated as ended:
         name = signal.Signals(ended.args[0]).name

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -23,6 +25,13 @@ def fails(bench, kind, match, **arguments):
     with pytest.raises(kind, match=match) as caught:
         bench.run(**arguments)
     return caught.value
+
+
+def seconds(said, what: str) -> float:
+    """The seconds that follow ``what`` in an error: as many as the machine adds."""
+    found = re.search(rf"{what} (\d+\.\d+) s", str(said))
+    assert found, f"{said} does not say for how long: {what}"
+    return float(found[1])
 
 
 def assert_stopped(bench, rule: str, text: str) -> None:

@@ -78,6 +78,14 @@ class FullSizeArm(ProgramArm):
 
 
 @OPERATORS.register_module()
+class PatientArm(ProgramArm):
+    """Its streams may be late, as they are while the machine stands still."""
+
+    def __init__(self, folder: str) -> None:
+        super().__init__(folder, max_age_s=PATIENCE_S, max_skew_s=PATIENCE_S)
+
+
+@OPERATORS.register_module()
 class WholeArm(Operator):
     """In one process, of the old shape: it cannot be divided, and its state comes with images.
 

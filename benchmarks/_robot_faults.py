@@ -231,6 +231,8 @@ class Result:
         record: ``episode.json``, None where there was no episode.
         commands: what the listener received, ``(N, 3)``.
         provoked: whether the fault was there; a machine that stalls may stop the arm before.
+        late: how many commands that moved the arm came after the fault, of a program of its own. A
+            machine that stands still meanwhile makes ``hold_s`` longer, and these no more.
     """
 
     hold_s: float | None
@@ -240,6 +242,7 @@ class Result:
     record: dict[str, Any] | None
     commands: Array
     provoked: bool
+    late: int | None = None
 
 
 @contextmanager

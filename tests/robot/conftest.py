@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -252,6 +253,18 @@ def make_rover() -> type[Rover]:
 @pytest.fixture
 def make_waver() -> type[Waver]:
     return Waver
+
+
+@pytest.fixture
+def hang():
+    """A call that does not return before the test is over."""
+    over = threading.Event()
+
+    def wait(*_: Any) -> None:
+        over.wait(60)
+
+    yield wait
+    over.set()
 
 
 @pytest.fixture

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import re
 import time
 
 import pytest
 
 from fluxvla_core.errors import NotReady, SafetyStop
-from tests.robot.faults import assert_stopped, fails
+from tests.robot.faults import assert_stopped, fails, seconds
 
 
 def stand_still(seconds):
@@ -18,18 +17,22 @@ def stand_still(seconds):
 
 @pytest.mark.parametrize("asynchronous", [False, True])
 @pytest.mark.realtime
-def test_a_get_frame_that_blocks_in_motion_is_not_the_policys_doing(bench, make_arm, asynchronous):
+def test_a_get_frame_that_blocks_in_motion_is_not_the_policys_doing(
+    bench, make_arm, hang, asynchronous
+):
     bench.arm = make_arm(realtime=True)
-    bench.arm.faults = {"get_frame": lambda: time.sleep(3), "after": 20}
+    bench.arm.faults = {"get_frame": hang, "after": 20}
 
+    # Longer than a machine stands still, which would be to blame then.
     error = fails(
         bench,
         SafetyStop,
-        r"safety.starvation_s is 0.3: Arm\.get_frame\(\) took \d\.\d+ s of that",
+        r"safety.starvation_s is 1: Arm\.get_frame\(\) took \d+\.\d+ s of that",
         async_execution=asynchronous,
         max_publish_step=500,
-        safety={"starvation_s": 0.3},
+        safety={"starvation_s": 1.0, "max_age_s": 5.0},
     )
+    assert seconds(error, r"get_frame\(\) took") > 0.5
     assert "camera that is read in this call" in error.cause
     assert_stopped(bench, "starvation", "Arm.get_frame()")
     assert any("Arm.get_frame() still hangs" in line for line in bench.notes.lines)
@@ -41,24 +44,25 @@ def test_a_get_frame_that_blocks_in_a_simulation_is_told(bench):
     def once():
         if len(bench.arm.sent) >= 20:
             bench.arm.faults.clear()
-            time.sleep(0.6)
+            time.sleep(1.5)  # longer than whoever tells it may be kept waiting
 
     bench.arm.faults = {"get_frame": once}
     assert bench.run(safety={"starvation_s": 0.2})["outcome"] == "max_steps"
 
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert re.search(r"Arm\.get_frame\(\) has not returned for \d\.\d s", line)
+    assert "Arm.get_frame() has not returned for " in line
 
 
 def test_a_get_frame_that_takes_too_long_in_a_simulation(bench):
-    bench.arm.faults = {"get_frame": lambda: time.sleep(0.3), "after": 20}
+    bench.arm.faults = {"get_frame": lambda: time.sleep(1.2), "after": 20}
 
-    fails(
+    error = fails(
         bench,
         SafetyStop,
-        r"no chunk within 0.2 s: Arm\.get_frame\(\) took \d\.\d+ s of that",
-        safety={"first_chunk_s": 0.2},
+        r"no chunk within 1 s: Arm\.get_frame\(\) took \d+\.\d+ s of that",
+        safety={"first_chunk_s": 1.0},
     )
+    assert seconds(error, r"get_frame\(\) took") >= 1.0
     assert_stopped(bench, "starvation", "Arm.get_frame()")
 
 
@@ -76,8 +80,10 @@ def test_a_get_frame_that_returns_late_says_which_stream_came_last(bench, make_a
 
     bench.arm.get_frame = late
 
-    error = fails(bench, SafetyStop, r"streams state and front are \d\.\d+ s apart")
-    assert re.match(r"Arm\.get_frame\(\) took \d\.\d+ s; front came last in it", error.cause)
+    error = fails(bench, SafetyStop, r"streams state and front are \d+\.\d+ s apart")
+    assert seconds(error, "streams state and front are") >= 0.4
+    assert "; front came last in it" in error.cause
+    assert seconds(error.cause, r"^Arm\.get_frame\(\) took") >= 0.4
 
 
 @pytest.mark.realtime
@@ -95,7 +101,7 @@ def test_a_process_that_stood_still_blames_neither_the_policy_nor_a_stream(bench
     fails(
         bench,
         SafetyStop,
-        r"safety.starvation_s is 0.3: this machine took \d\.\d+ s of that",
+        r"safety.starvation_s is 0.3: this machine took \d+\.\d+ s of that",
         max_publish_step=500,
         safety={"starvation_s": 0.3},
     )
@@ -121,13 +127,13 @@ def test_a_send_action_that_blocks_is_told(bench, make_arm):
 
     def once():
         if len(bench.arm.sent) == 20:
-            time.sleep(0.6)
+            time.sleep(1.5)  # longer than whoever tells it may be kept waiting
 
     bench.arm.faults = {"send_action": once}
     bench.run(safety={"starvation_s": 0.2})
 
     (line,) = [line for line in bench.notes.lines if line.startswith("warning")]
-    assert re.search(r"Arm\.send_action\(\) has not returned for \d\.\d s", line)
+    assert "Arm.send_action() has not returned for " in line
 
 
 @pytest.mark.realtime
@@ -143,9 +149,9 @@ def test_an_operator_whose_stop_hangs_does_not_hang_the_run(bench, make_arm, mon
 
 
 @pytest.mark.realtime
-def test_a_robot_whose_get_frame_hangs(bench, make_arm):
+def test_a_robot_whose_get_frame_hangs(bench, make_arm, hang):
     bench.arm = make_arm(realtime=True)
-    bench.arm.faults["get_frame"] = lambda: time.sleep(2)
+    bench.arm.faults["get_frame"] = hang
 
     fails(bench, NotReady, r"Arm\.get_frame does not return", ready_timeout=0.2)
     assert bench.arm.sent == []

@@ -88,14 +88,15 @@ def slow(arm: Arm, policy: Waver) -> None:
     """Every answer takes longer than its chunk lasts."""
 
     def late(chunk):
-        time.sleep(1.2)
+        time.sleep(2.0)
         return chunk
 
     policy.faults = dict.fromkeys(range(3, 99), late)
 
 
 def hanging(arm: Arm, policy: Waver) -> None:
-    policy.faults[3] = lambda chunk: time.sleep(4)
+    # The fourth answer at the earliest is in motion: slow ones before it are asked for again.
+    policy.faults[4] = lambda chunk: time.sleep(6)
 
 
 def raising(arm: Arm, policy: Waver) -> None:
@@ -110,7 +111,8 @@ def frozen(arm: Arm, policy: Waver) -> None:
     arm.faults["frozen_after"] = 20
 
 
-QUICK = {"safety": {"starvation_s": 0.3}}
+# Longer than machines that run tests stand still, which would be to blame then.
+QUICK = {"safety": {"starvation_s": 1.0, "max_age_s": 5.0, "max_skew_s": 5.0}}
 FAULTS = {
     "NaN in a chunk": Fault("chunk", "the policy's chunk is not finite", spoilt(np.nan)),
     "Inf in a chunk": Fault("chunk", "the policy's chunk is not finite", spoilt(np.inf)),
@@ -220,12 +222,12 @@ def test_a_policy_that_is_slow_now_and_then_is_waited_for(bench, make_arm):
     bench.arm = make_arm(realtime=True)
 
     def late(chunk):
-        time.sleep(0.9)
+        time.sleep(2.0)
         return chunk
 
     bench.policy.faults[4] = late
 
-    result = bench.run(max_publish_step=120, safety={"starvation_s": 30.0})
+    result = bench.run(max_publish_step=220, safety={"starvation_s": 30.0, "max_age_s": 5.0})
 
     assert result["outcome"] == "max_steps"
     commands = [row for row in bench.trace() if row["event"] == "command"]

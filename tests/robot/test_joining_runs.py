@@ -127,7 +127,8 @@ def test_in_real_time_the_policy_is_told_what_is_executed_meanwhile(bench, make_
     assert going.told[0] is None, "nothing is under way at first"
     assert len(told) >= 3
     # 0.12 s and more are two actions of 10 Hz at least; and never more than there are.
-    assert all(2 <= rest.frozen <= 5 for rest in told)
+    # Where the machine stood still, fewer than two may be left: those that count.
+    assert all(min(2, (rest.weights > 0).sum()) <= rest.frozen <= 5 for rest in told)
     assert all((rest.weights[: rest.frozen] == 1).all() for rest in told)
     bench.assert_within_limits()
 
@@ -152,20 +153,27 @@ def test_the_target_has_no_seam_where_a_policy_keeps_to_what_is_frozen(bench, ma
     going.slow_s = 0.15
     going.waver.stride = 0.05
     going.waver.goal = 1.4
-    jumps = {}
+    seams = {}
     for method in ("latest_only", "rtc"):
         bench.arm = make_arm(realtime=True)
         lagging(bench.arm)
         bench.run(chunk_joining=method, max_publish_step=75)
         name = sorted(path.name for path in (bench.work_dir / "inference").iterdir())[-1]
         wanted = [
-            row["wanted"][0]
+            (row["t"], row["wanted"][0])
             for row in bench.trace(name)
             if row["event"] == "command" and row["phase"] == "run"
         ]
-        jumps[method] = max(abs(b - a) for a, b in itertools.pairwise(wanted))
-    # 0.05 rad an action are 0.01 rad a command; a tick that is missed makes it a few times that.
-    assert jumps["rtc"] < jumps["latest_only"]
+        # By the time between two commands: a tick that is missed is no seam.
+        jumps = [
+            abs(after - before) / max((later - at) * 50.0, 1.0)
+            for (at, before), (later, after) in itertools.pairwise(wanted)
+        ]
+        seams[method] = sum(jump > 0.03 for jump in jumps)
+    # 0.05 rad an action are 0.01 rad a command, and each chunk starts 0.1 rad behind. With
+    # real-time chunking there is a seam only where the machine stood still for a chunk's rest.
+    assert seams["latest_only"] >= 3
+    assert seams["rtc"] < seams["latest_only"] / 2
 
 
 def lagging(arm):

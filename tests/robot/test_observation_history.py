@@ -73,21 +73,52 @@ def test_in_lockstep_it_is_a_queue_that_is_filled_at_every_action(bench, looking
     assert looking.names == {"wave at the camera"}
 
 
+def in_time(bench, seen: list[list[int]]) -> list[list[int]]:
+    """Those whose commands were all sent in time, as recorded.
+
+    What is seen is counted in commands. A machine that stands still sends none meanwhile, and
+    nobody looks at the arm.
+    """
+    newest = max((bench.work_dir / "inference").iterdir()).name
+    times = [row["t"] for row in bench.trace(newest) if row["event"] == "command"]
+    late = np.diff(times) > 0.05
+    return [steps for steps in seen if not late[max(steps[0] - 1, 0) : steps[-1] + 1].any()]
+
+
+def observed_in_time(
+    bench, make_arm, waver, slow_s: float = 0.0, **settings: Any
+) -> list[list[int]]:
+    """What a policy saw of an arm in real time, from its second question on.
+
+    Tried again while too little of it is of a machine that ran.
+    """
+    for _ in range(3):
+        bench.arm = make_arm(realtime=True)
+        bench.policy = looking = Looking(waver, slow_s)
+        bench.run(control_process=False, safety={"max_age_s": 5.0, "max_skew_s": 5.0}, **settings)
+        assert len(looking.seen) >= 3
+        assert looking.seen[0] == [0, 0, 0]
+        found = in_time(bench, looking.seen[1:])
+        if len(found) >= 2:
+            return found
+    pytest.fail("three times this machine stood still again and again")
+
+
+@pytest.mark.realtime
 @pytest.mark.parametrize("method", ["synchronous", "latest_only"])
 @pytest.mark.realtime
 def test_an_arm_in_real_time_is_looked_at_between_two_questions(bench, make_arm, method):
-    bench.arm = make_arm(realtime=True)
-    bench.policy = looking = Looking(bench.policy)
-    bench.run(chunk_joining=method, execute_horizon=3, max_publish_step=60, control_process=False)
+    found = observed_in_time(
+        bench, make_arm, bench.policy, chunk_joining=method, execute_horizon=3, max_publish_step=60
+    )
 
-    assert looking.seen[0] == [0, 0, 0]
-    assert len(looking.seen) >= 3
-    for *before, last in looking.seen[1:]:
+    for *before, last in found:
         for back, step in zip((2, 1), before, strict=True):
             # 0.6 of an action away at most, and one command for what the machine adds
             assert abs(step - max(last - back * STRIDE, 0)) <= 4
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("thinks_s", [0.0, 0.15])
 @pytest.mark.realtime
 def test_what_it_saw_in_real_time_is_recorded_and_can_be_shown_again(bench, make_arm, thinks_s):
@@ -114,12 +145,11 @@ def test_what_it_saw_in_real_time_is_recorded_and_can_be_shown_again(bench, make
 @pytest.mark.realtime
 def test_a_policy_that_thinks_all_the_time_waits_for_what_it_needs(bench, make_arm):
     """Asked again as soon as it has answered, it has seen nothing of the time in between."""
-    bench.arm = make_arm(realtime=True)
-    bench.policy = looking = Looking(bench.policy, slow_s=0.3)
-    bench.run(chunk_joining="latest_only", max_publish_step=100, control_process=False)
+    found = observed_in_time(
+        bench, make_arm, bench.policy, 0.3, chunk_joining="latest_only", max_publish_step=100
+    )
 
-    assert len(looking.seen) >= 3
-    for *before, last in looking.seen[2:]:
+    for *before, last in found[1:]:
         assert [last - step for step in before] == pytest.approx([10, 5], abs=4)
 
 

@@ -29,9 +29,9 @@ def path(make_bench, tmp_path_factory):
     return str(bench.work_dir / "001-1")
 
 
-def again(bench, path, **arguments):
-    bench.run(record=str(bench.work_dir / "rec"), prepare_pose=[0.1, 0, 0.5], **arguments)
-    return open_recording(path), open_recording(bench.work_dir / "rec")
+def again(bench, path, folder="rec", **arguments):
+    bench.run(record=str(bench.work_dir / folder), prepare_pose=[0.1, 0, 0.5], **arguments)
+    return open_recording(path), open_recording(bench.work_dir / folder)
 
 
 class TestReplayOperator(OperatorConformance):
@@ -332,11 +332,18 @@ def test_every_joiner_plays_the_last_recorded_answer_to_its_end(bench, make_arm,
 @pytest.mark.realtime
 @pytest.mark.parametrize("method", ["latest_only", "rtc"])
 def test_on_a_robot_the_recorded_commands_are_sent_to_the_last(bench, path, make_arm, method):
-    bench.arm = make_arm(realtime=True)
     table = {"type": "ReplayPolicy", "recording": path, "actions": "commands"}
-    first, second = again(bench, path, policy=table, chunk_joining=method, max_publish_step=1000)
+    for attempt in range(3):
+        bench.arm = make_arm(realtime=True)
+        first, second = again(
+            bench, path, f"rec-{attempt}", policy=table, chunk_joining=method,
+            max_publish_step=1000,
+        )  # fmt: skip
+        times, sent = second.commands("run")
+        # A machine that stands still leaves commands out, the last ones among them.
+        if np.diff(times).max() < 0.05:
+            break
 
-    _, sent = second.commands("run")
     # Of the beginning, what was over when the policy had answered is left out.
     np.testing.assert_allclose(sent[-1], first.commands("run")[1][-1], rtol=0, atol=1e-6)
     assert second.summary()["outcome"] == "recording_ended"

@@ -380,7 +380,7 @@ def test_while_the_policy_warms_up_the_arm_is_held_at_the_start_pose(bench, make
     bench.arm = make_arm(realtime=True)
 
     def warm_up(chunk):
-        time.sleep(0.5)
+        time.sleep(1.5)
         return chunk
 
     bench.policy.faults[1] = warm_up

@@ -12,7 +12,7 @@ import pytest
 from fluxvla_core.build import RunContext, build_runner_from_cfg
 from fluxvla_core.errors import ConfigError, FluxError, SafetyStop
 
-from .whole import SPEC, Looking, Notes, Run, module
+from .whole import PATIENT, SPEC, Looking, Notes, Run, module
 
 __all__ = ["module"]
 
@@ -33,6 +33,7 @@ class SpecRun(Run):
             "camera_names": ["front"],
             "record_fps": None,
             "max_publish_step": 60,
+            "safety": PATIENT,
             **changed,
         }
         context = RunContext(
@@ -65,7 +66,7 @@ def test_a_runner_with_commands_of_its_own_has_them_in_the_control_process(tmp_p
 
 
 def test_such_an_arm_is_held_when_the_policy_keeps_the_interpreter(tmp_path, module):
-    run = SpecRun(tmp_path, max_publish_step=1000)
+    run = SpecRun(tmp_path, max_publish_step=1000, safety={})
 
     def keep(observation, answer=run.policy.predict_action):
         if len(run.policy.seen) == 4:
@@ -73,7 +74,7 @@ def test_such_an_arm_is_held_when_the_policy_keeps_the_interpreter(tmp_path, mod
         return answer(observation)
 
     run.policy.thinks_s, run.policy.predict_action = 0.0, keep
-    with pytest.raises(SafetyStop, match=r"the main process did not run for \d\.\d+ s"):
+    with pytest.raises(SafetyStop, match=r"the main process did not run for \d+\.\d+ s"):
         run.runner.run()
 
     assert [trip["rule"] for trip in run.episode["trips"]] == ["main process"]

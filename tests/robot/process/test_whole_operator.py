@@ -133,8 +133,9 @@ def test_a_slow_get_frame_makes_no_command_late(tmp_path, module):
 
     gaps = np.diff(run.log("sent")[:, 0])
     assert len(run.policy.seen) >= 5
-    # Several looks of 0.15 s: a thread that waited for one would miss seven commands.
-    assert np.quantile(gaps, 0.95) < 0.03
+    # Several looks of 0.15 s: a thread that waited for one would miss seven commands, at every
+    # second one. A machine that is busy with others misses a few.
+    assert np.quantile(gaps, 0.8) < 0.05
     run.assert_within_limits()
 
 
@@ -142,15 +143,16 @@ def test_a_held_arm_hears_commands_while_the_next_episode_begins(tmp_path, modul
     """Some drivers stop an arm that hears nothing."""
     (tmp_path / "tasks.txt").write_text("1\n1\n")
     run = Run(tmp_path, task_file=str(tmp_path / "tasks.txt"), max_publish_step=25)
-    run.policy.resets_s = 1.0
+    run.policy.resets_s = 2.0
 
     assert run.runner.run()["episodes"] == 2
 
     sent = run.log("sent")
-    assert np.diff(sent[:, 0]).max() < 0.5
-    # Three resets of a second, of the second episode, in which the arm is held.
+    # Shorter than one reset, by more than a machine stands still.
+    assert np.diff(sent[:, 0]).max() < 1.5
+    # Three resets of two seconds, of the second episode, in which the arm is held.
     rests = np.abs(np.diff(sent[:, 1:], axis=0)).max(axis=1) == 0.0
-    assert rests.sum() > 100
+    assert rests.sum() > 200
     run.assert_within_limits()
 
 

@@ -235,14 +235,39 @@ class TestFaults:
             robot.tell(frozen=True)
             wait_for(lambda: robot.ask()["ended"] == "watchdog")
 
-    def test_a_controller_that_is_gone(self, robot, connect):
-        operator = connect(robot)
-        operator.send_action(POSE)
+    def test_a_controller_that_is_gone(self, robot):
+        # In a program of its own: the client's threads still look for controllers of other tests,
+        # and may crash the process in which they are.
+        program = (
+            "import sys, time\n"
+            "from fluxvla_core.errors import Faulted\n"
+            "from fluxvla_core.ros2 import Stale\n"
+            "from fluxvla_ur.rtde import URRTDEOperator\n"
+            f"operator = URRTDEOperator(sys.argv[1], **{PATIENT!r})\n"
+            "operator.connect()\n"
+            "pose = operator.get_state()\n"
+            "try:\n"
+            "    while True:\n"
+            "        operator.send_action(pose)\n"
+            "        print('moving', flush=True)\n"
+            "        time.sleep(0.02)\n"
+            "except (Stale, Faulted) as error:\n"
+            "    print('refused:', error.what, flush=True)\n"
+            "operator.stop()\n"
+            "print('stopped', flush=True)\n"
+            "time.sleep(60)\n"
+        )
+        other = subprocess.Popen(
+            [sys.executable, "-c", program, robot.ip], stdout=subprocess.PIPE, text=True
+        )
+        assert other.stdout.readline() == "moving\n"
         robot.kill()
-
-        error = said(operator, (Stale, Faulted))
-        assert "silent" in error.what or "has ended" in error.what
-        operator.stop()
+        # The client prints, too.
+        refused = next((line for line in other.stdout if "refused: " in line), "nothing")
+        assert "silent" in refused or "has ended" in refused
+        assert any(line.endswith("stopped\n") for line in other.stdout)
+        other.kill()
+        other.communicate(timeout=10.0)
 
     def test_the_controller_stops_the_arm_of_a_program_that_was_killed(self):
         robot = FakeUR(slack_s=SLACK_S)

@@ -68,21 +68,18 @@ class ProgramArm(BenchArm):
 
 
 @OPERATORS.register_module()
-class FullSizeArm(ProgramArm):
-    """Its images have the size of a usual camera's, more than a packet, and may be late."""
-
-    embodiment = FULL_SIZE
+class PatientArm(ProgramArm):
+    """Its streams may be late, as they are while the machine stands still."""
 
     def __init__(self, folder: str) -> None:
         super().__init__(folder, max_age_s=PATIENCE_S, max_skew_s=PATIENCE_S)
 
 
 @OPERATORS.register_module()
-class PatientArm(ProgramArm):
-    """Its streams may be late, as they are while the machine stands still."""
+class FullSizeArm(PatientArm):
+    """Its images have the size of a usual camera's, more than a packet."""
 
-    def __init__(self, folder: str) -> None:
-        super().__init__(folder, max_age_s=PATIENCE_S, max_skew_s=PATIENCE_S)
+    embodiment = FULL_SIZE
 
 
 @OPERATORS.register_module()

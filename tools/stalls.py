@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import suppress
 
 STALL_S = 0.1
 """Seconds without a chance to run that count as a stall."""
@@ -56,11 +57,9 @@ class StallWatch:
     def longest_s(self, since: float) -> float:
         """The longest stall that ended after ``since`` (``time.monotonic()``), in seconds."""
         time.sleep(2 * STALL_S)  # for the one that ends just now
-        try:
+        with suppress(BlockingIOError):  # that was all
             while data := os.read(self._pipe, 65536):
                 self._text += data
-        except BlockingIOError:
-            pass  # that was all
         *lines, self._text = self._text.split(b"\n")
         stalls = [[float(word) for word in line.split()] for line in lines if line]
         return max((ended - began for began, ended in stalls if ended > since), default=0.0)

@@ -19,16 +19,14 @@ import pytest
 
 from benchmarks._process_faults import (
     CYCLONE_FAULT,
-    END_S,
     PREFIX,
     PROCESS_FAULTS,
-    START_S,
     patient,
     play,
-    program,
 )
 from benchmarks._process_program import PROVOKED, SENT
 from benchmarks._robot_faults import GOES_ON, MOVING, NAMES, STOP, stage_crew
+from benchmarks._terminal_program import END_S, START_S, program
 from fluxvla_core.robot.recording.recorded import open_recording
 
 pytestmark = pytest.mark.realtime

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -171,6 +172,19 @@ def commanded(operator):
     wait_for(sent)
 
 
+@contextmanager
+def driving(program, robot):
+    """A program of its own, given the robot's address, once it has said that the arm moves; it is
+    killed in the end."""
+    command = [sys.executable, "-c", program, robot.ip]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        try:
+            assert other.stdout.readline() == "moving\n"
+            yield other
+        finally:
+            other.kill()
+
+
 class TestFaults:
     """Each ends the commands; its name is what a person reads."""
 
@@ -257,17 +271,12 @@ class TestFaults:
             "print('stopped', flush=True)\n"
             "time.sleep(60)\n"
         )
-        other = subprocess.Popen(
-            [sys.executable, "-c", program, robot.ip], stdout=subprocess.PIPE, text=True
-        )
-        assert other.stdout.readline() == "moving\n"
-        robot.kill()
-        # The client prints, too.
-        refused = next((line for line in other.stdout if "refused: " in line), "nothing")
-        assert "silent" in refused or "has ended" in refused
-        assert any(line.endswith("stopped\n") for line in other.stdout)
-        other.kill()
-        other.communicate(timeout=10.0)
+        with driving(program, robot) as other:
+            robot.kill()
+            # The client prints, too.
+            refused = next((line for line in other.stdout if "refused: " in line), "nothing")
+            assert "silent" in refused or "has ended" in refused
+            assert any(line.endswith("stopped\n") for line in other.stdout)
 
     def test_the_controller_stops_the_arm_of_a_program_that_was_killed(self):
         robot = FakeUR(slack_s=SLACK_S)
@@ -283,14 +292,9 @@ class TestFaults:
             "    operator.send_action(state)\n"
             "    time.sleep(0.02)\n"
         )
-        other = subprocess.Popen(
-            [sys.executable, "-c", program, robot.ip], stdout=subprocess.PIPE, text=True
-        )
-        assert other.stdout.readline() == "moving\n"
-        wait_for(lambda: len(robot.ask()["servo"]) > 5)
-        assert robot.ask()["running"]
-        other.kill()
-        other.communicate(timeout=10.0)
+        with driving(program, robot):
+            wait_for(lambda: len(robot.ask()["servo"]) > 5)
+            assert robot.ask()["running"]
         wait_for(lambda: not robot.ask()["running"])
 
         assert robot.ask()["ended"] == "watchdog"

@@ -6,7 +6,6 @@ import ctypes
 import logging
 import os
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -22,7 +21,6 @@ from fluxvla_core.signals import requests_to_stop, signal_name
 
 _STOP_S = 30
 """Seconds that torch's agent gives the other ranks to end when one has failed."""
-_HERE = "127.0.0.1"
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -53,6 +51,8 @@ def launch(
         from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs, SignalException
         from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
         from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+        from fluxvla_core.training.distributed import loopback_store
     except ModuleNotFoundError as error:
         raise UsageError(
             f"--nproc needs {error.name}, which is not installed",
@@ -67,16 +67,16 @@ def launch(
         with _scratch() as folder:
             os.environ[ranks.ERROR_DIR] = folder
             os.environ[ranks.LAUNCHER] = str(os.getpid())
-            store = _store()
+            store = loopback_store()
             config = LaunchConfig(
                 min_nodes=1,
                 max_nodes=1,
                 nproc_per_node=nproc,
                 run_id=uuid.uuid4().hex,
                 rdzv_backend="static",
-                rdzv_endpoint=f"{_HERE}:{store.port}",
+                rdzv_endpoint=f"{store.host}:{store.port}",
                 rdzv_configs={"rank": 0},
-                local_addr=_HERE,
+                local_addr=store.host,
                 max_restarts=restarts,
                 signals_to_handle=",".join(signal.Signals(n).name for n in requests_to_stop()),
                 shutdown_timeout=grace,
@@ -93,22 +93,6 @@ def launch(
         for name in (ranks.ERROR_DIR, ranks.LAUNCHER):
             os.environ.pop(name, None)
         logging.disable(logging.NOTSET)
-
-
-def _store() -> Any:
-    """The store by which agent and ranks find each other, on the loopback interface alone.
-
-    Anyone who reaches such a store can change where ranks connect to. Without a socket of ours
-    torch listens on all interfaces. The rendezvous "static", which pickles nothing, uses the store
-    that this process already has at its port.
-    """
-    from torch.distributed import TCPStore  # type: ignore[attr-defined]
-
-    listener = socket.create_server((_HERE, 0))
-    port = listener.getsockname()[1]
-    return TCPStore(
-        _HERE, port, 1, is_master=True, multi_tenant=True, master_listen_fd=listener.detach()
-    )
 
 
 def _scratch() -> tempfile.TemporaryDirectory[str]:

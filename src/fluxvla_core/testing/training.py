@@ -8,7 +8,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,6 +37,7 @@ from fluxvla_core.testing.comparisons import (
 )
 from fluxvla_core.training import stop
 from fluxvla_core.training.base_runner import BaseTrainRunner
+from fluxvla_core.training.distributed import LOOPBACK, loopback_store
 
 __all__ = [
     "ACTIONS",
@@ -370,7 +370,7 @@ def run_ranks(
     context = multiprocessing.get_context("forkserver")
     # Slow to import, so only for those who use it.
     context.set_forkserver_preload([*PRELOAD, *(n for n in ("peft",) if n in sys.modules)])
-    store = _store() if ranks > 1 else None  # kept until all have ended
+    store = loopback_store() if ranks > 1 else None  # kept until all have ended
     port = 0 if store is None else store.port
     processes = [
         context.Process(target=_rank, args=(rank, ranks, port, usual, function, args))
@@ -406,24 +406,8 @@ def _rank(
             LOCAL_RANK=str(rank),
             WORLD_SIZE=str(ranks),
             LOCAL_WORLD_SIZE=str(ranks),
-            MASTER_ADDR="127.0.0.1",
+            MASTER_ADDR=LOOPBACK,
             MASTER_PORT=str(port),
             TORCHELASTIC_USE_AGENT_STORE=str(True),
         )
     function(*args)
-
-
-def _store() -> Any:
-    """The store by which the ranks find each other, as torch's own agent has it for its ranks.
-
-    A port that is only found to be free may be another program's by the time rank 0 listens at it.
-    """
-    listener = socket.create_server(("127.0.0.1", 0))
-    port = listener.getsockname()[1]
-    return torch.distributed.TCPStore(  # type: ignore[attr-defined]
-        "127.0.0.1",
-        port,
-        is_master=True,
-        wait_for_workers=False,
-        master_listen_fd=listener.detach(),
-    )

@@ -18,11 +18,13 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.distributed import PrefixStore  # type: ignore[attr-defined]
+from torch.distributed import PrefixStore, TCPStore  # type: ignore[attr-defined]
 from torch.distributed.rendezvous import rendezvous
 
 from fluxvla_core import errors
 from fluxvla_core.errors import ConfigError, FluxError
+
+LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,20 @@ class World:
         message = "World.first is deprecated, use World.is_rank0"
         warnings.warn(message, DeprecationWarning, stacklevel=2)
         return self.is_rank0
+
+
+def loopback_store() -> TCPStore:
+    """A store by which ranks find each other, at a free port of the loopback interface alone.
+
+    This process hosts it for as long as it keeps it. Anyone who reaches such a store can change
+    where ranks connect to, and without a socket of ours torch listens on all interfaces. A port
+    that is only found to be free may be another program's by the time somebody listens at it.
+    """
+    listener = socket.create_server((LOOPBACK, 0))
+    port = listener.getsockname()[1]
+    return TCPStore(
+        LOOPBACK, port, 1, is_master=True, multi_tenant=True, master_listen_fd=listener.detach()
+    )
 
 
 def start(device: str = "auto", group_of_one: bool = False) -> World:
